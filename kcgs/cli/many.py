@@ -89,7 +89,8 @@ def fit_many_command(
         raise typer.Exit(INTERRUPTED) from None
     finally:
         rows = [{"image": str(jobs[index].image), **outcomes[index].row} for index in sorted(outcomes)]
-        _write_table(output / "results.csv", rows)
+        if any("error" not in row for row in rows):  # where all were refused, the table of the scenes there stays
+            _write_table(output / "results.csv", rows)
     failures = [row for row in rows if "error" in row]
     misses = [row for row in rows if row.get("target_reached") is False]
     num_fits = sum(outcome.is_new for outcome in outcomes.values()) - len(failures)

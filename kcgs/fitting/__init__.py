@@ -2,8 +2,7 @@
 
 from .config import FitConfig, available_recipes
 from .initial import initial_field
-from .loop import fit
-from .precompile import precompile
+from .loop import fit, precompile
 from .region_report import RegionReport
 from .result import FitResult, HistoryEntry
 

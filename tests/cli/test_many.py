@@ -97,6 +97,8 @@ class TestResume:
         code, out, err = fit_many(*arguments)
         assert (code, json.loads(out)["failed"]) == (1, 1) and err.startswith("kcgs: b.png: ")
         assert "b.safetensors exists, made with other settings; --overwrite replaces it\n" in err
+        before = rows()
+        assert fit_many("photos/b.png", *SETTINGS).code == 1 and rows() == before  # all is refused
         assert json.loads(fit_many(*arguments, "--overwrite").out)["fitted"] == 1
         assert json.loads(fit_many(*arguments, "--overwrite", "--seed", "1").out)["fitted"] == 2
 

@@ -14,6 +14,7 @@ from kcgs.data import chart_2x3, chart_pie
 from kcgs.fitting import available_recipes
 from kcgs.fitting.optimizers import ImageGSAdam
 from kcgs.functional import ef_psnr, psnr
+from tests.conftest import Clock
 
 
 def disc(size: tuple[int, int] = (32, 40)) -> tuple[Tensor, Tensor]:
@@ -206,6 +207,11 @@ class TestStopping:
         result = fit(image, labels, 12, recipe=quick(iterations=10**7, max_seconds=0.5))
         assert result.stop_reason == "seconds"
         assert 0.4 < result.history[-1].seconds < 0.6
+
+    def test_compilation_takes_none_of_the_time(self, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("kcgs.fitting.loop.precompile", lambda config: clock.advance(100.0))
+        result = fit(*disc(), 12, recipe=quick(iterations=10**7, max_seconds=0.5))
+        assert clock.seconds > 100 and result.seconds < 1
 
     def test_callback(self) -> None:
         image, labels = disc()
