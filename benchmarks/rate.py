@@ -164,7 +164,7 @@ def page(folder: Path, rows: list[Row]) -> Page:
         if "Kodak" in groups
         for size, psnr in zip(BYTES, curve, strict=False)
     ]
-    fitting = [row for row in rows if row["bytes"] <= row["target_bytes"]]
+    fitting = [row for rows in groups.values() for row in rows if row["bytes"] <= row["target_bytes"]]
     table = means_table([*fitting, *printed], ["group", "method"], "target_bytes", ("psnr", "ssimulacra2"))
     losses = losses_table(equal, comparisons, ("psnr", "ef_psnr", "ssimulacra2"), CASES)
     gains = differences(equal, comparisons, QUANTITIES, CASES)
