@@ -105,8 +105,9 @@ def precompile(config: FitConfig) -> None:
     ramp = torch.linspace(0.0, 1.0, 96)
     image = torch.stack([ramp.expand(64, 96), 1 - ramp.expand(64, 96), (8 * ramp).sin().square().expand(64, 96)])
     labels = (ramp > 0.6).long().expand(64, 96).contiguous()
-    short = {"iterations": min(config.usual_iterations, 20), "max_seconds": None, "target_psnr": None}
-    fit(image, labels, 24, recipe=config.model_copy(update=short))
+    iterations = min(config.usual_iterations, 20)
+    update = {"iterations": iterations, "max_seconds": None, "target_psnr": None, "backend": "auto"}
+    fit(image, labels, 24, recipe=config.model_copy(update=update))
 
 
 def fit_problem(
