@@ -15,8 +15,8 @@ LINK = "../benchmarks/reports"
 HEAD = """# Results
 
 Each answer comes from a report of one page, with a table, what loses, and the command that measures it anew. All but
-those that say so were measured with one tree of `kcgs/`, `{tree}`. Later changes concern GPUs
-and messages: on a CPU, results are the same bits.
+those that say so were measured with one tree of `kcgs/`, `{tree}`. Later changes concern GPUs,
+compilation and messages: on a CPU, results are the same bits.
 
 ```sh
 python -m benchmarks quality -o report --data DATA --workers 2

@@ -123,7 +123,7 @@ def rendered_size(field_size: tuple[int, int], size: tuple[int, int]) -> tuple[i
 
 
 def _larger(a: int, b: int) -> int:
-    # torch.compile sees int in a size of its own, torch.export does not, and max would fix the size there
+    # torch.export traces sizes that are no int, which max would fix; torch.compile of torch 2.11 lacks sym_max of int
     return max(a, b) if isinstance(a, int) and isinstance(b, int) else torch.sym_max(a, b)
 
 
