@@ -86,13 +86,13 @@ def page(folder: Path, rows: list[Row]) -> Page:
     """Write the report."""
     panels = [Panel("", rows, "frame", quantity, ("linear", "linear")) for quantity in ("psnr", "ef_psnr")]
     save_lines(folder / "video.png", panels, "method", "frame", marker=False)
-    gains = {quantity: mean_gain(rows, COMPARISON, quantity) for quantity in QUANTITIES}
+    psnr, ef_psnr = (mean_gain(rows, COMPARISON, quantity) for quantity in ("psnr", "ef_psnr"))
     times, flickers = (
         [fmean(values_of((row for row in rows if row["method"] == name), quantity)) for name in COMPARISON[::-1]]
         for quantity in ("core_seconds", "flicker")
     )
     answer = (
-        f"The fit of a video has {gains['psnr']:+.2f} dB PSNR and {gains['ef_psnr']:+.2f} dB EF-PSNR against fits of "
+        f"The fit of a video has {psnr:+.2f} dB PSNR and {ef_psnr:+.2f} dB EF-PSNR against fits of "
         f"its frames alone, and is {times[0] / times[1]:.1f} times as fast. It flickers by {flickers[1]:.2f} levels, "
         f"those by {flickers[0]:.2f}. Only its Gaussians can be followed from frame to frame."
     )

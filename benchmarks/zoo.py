@@ -31,8 +31,8 @@ class Plan(NamedTuple):
 
 
 PLANS: dict[str, Plan] = {
-    "chart-2x3": Plan("2x3", 20, "chart of six colours, 20 Gaussians", _CHART),
-    "chart-pie": Plan("pie", 20, "chart of eight sectors, 20 Gaussians", _CHART),
+    "chart-2x3": Plan("2x3", 20, "chart of six colours", _CHART),
+    "chart-pie": Plan("pie", 20, "chart of eight sectors", _CHART),
     "astronaut-400": Plan("astronaut", 400, "portrait, few Gaussians", _NASA),
     "astronaut-3000": Plan("astronaut", 3_000, "portrait, many Gaussians", _NASA),
     "chelsea-500": Plan("chelsea", 500, "cat, few Gaussians", _CC0),
