@@ -96,9 +96,9 @@ def page(folder: Path, rows: list[Row]) -> Page:
     wins = [count_wins(rows, lanczos, quantity, cases) for quantity in QUANTITIES]
     photo = mean_gain(rows, Comparison("small photo, bicubic", SCENE), "psnr", cases)
     answer = (
-        f"The PSNR / EF-PSNR of a scene that is rendered large is {', '.join(changes)}, against its own small render, "
-        f"enlarged by Lanczos; it is higher in {wins[0]} and {wins[1]} cases. The small photo itself, with all of its "
-        f"pixels, has {photo:+.2f} dB against the scene."
+        f"Against its own small render enlarged by Lanczos, a large render has PSNR / EF-PSNR {', '.join(changes)}. "
+        f"Its PSNR is higher in {wins[0]} cases, its EF-PSNR in {wins[1]}. The small photo itself, enlarged, has "
+        f"{photo:+.2f} dB against the scene."
     )
     table = means_table(rows, ["group", "factor", "method"], "pixels per Gaussian", QUANTITIES)
     losses = losses_table(rows, COMPARISONS, QUANTITIES, cases)

@@ -102,8 +102,8 @@ def page(folder: Path, rows: list[Row]) -> Page:
     steep = [100 * sum(values_of(part, "steep")) / sum(values_of(part, "pixels")) for part in (filled, bare)]
     beyond = max(values_of(filled, "beyond [0, 1]"))
     answer = (
-        f"In filled holes {steep[0]:.2f} % of the pixels are steeper than their surroundings, in holes that are left "
-        f"{steep[1]:.2f} %. Filling takes {fmean(values_of(filled, 'core_seconds')):.1f} seconds of a core, and no "
+        f"Gradients stronger than those around cover {steep[0]:.2f} % of filled holes, and {steep[1]:.2f} % of holes "
+        f"that are left. Filling takes {fmean(values_of(filled, 'core_seconds')):.1f} seconds of a core, and no "
         f"value is more than {beyond:.2f} beyond [0, 1]."
     )
     columns = ("pixels", *QUANTITIES, "steepest", "core_seconds", "added")

@@ -94,8 +94,8 @@ def page(folder: Path, rows: list[Row]) -> Page:
     )
     answer = (
         f"Forward and backward, `cuda` is {tiled} as fast as `tiled` on the same GPU, and {cpu} as fast as `cpu` on "
-        f"all cores beside it. Its largest error at the default cutoff is {error:.1g}; of Gaussians up to a million "
-        f"times longer than wide, without a cutoff, {stiff_error:.1g}."
+        f"all cores beside it. Its largest error is {error:.1g} at the default cutoff, and {stiff_error:.1g} without a "
+        "cutoff, even of Gaussians a million times longer than wide."
     )
     columns = ("forward_ms", "both_ms", "image_error", "gradient_error", "peak_MB")
     table = means_table([*default, *stiff], ["image", "method"], "", columns)

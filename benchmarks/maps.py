@@ -1,4 +1,4 @@
-"""When do label maps pay that are found in the image itself?"""
+"""What do automatic label maps gain?"""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ def page(folder: Path, rows: list[Row]) -> Page:
     at_few, at_many = (" / ".join(f"{mean_gain(part, SAME_N, q):+.2f}" for q in QUANTITIES) for part in (few, many))
     at_bits = " / ".join(f"{mean_gain(equal, EQUAL_BITS, quantity, ['n']):+.2f}" for quantity in DECODED)
     answer = (
-        f"With as many Gaussians, found maps change PSNR / EF-PSNR by {at_few} dB at N = {fewest:,} and by {at_many} "
-        f"dB at N = {most:,}. With as many bytes, map included, the change is {at_bits} dB."
+        f"With as many Gaussians, automatic maps change PSNR / EF-PSNR by {at_few} dB at N = {fewest:,} and by "
+        f"{at_many} dB at N = {most:,}. With as many bytes, map included, the change is {at_bits} dB."
     )
     titles = {" - ".join(SAME_N): "gain at the same N", " - ".join(EQUAL_BITS): "gain at the same bytes"}
     lines = [row | {"method": titles[row["method"]]} for row in gains]
@@ -73,5 +73,5 @@ def page(folder: Path, rows: list[Row]) -> Page:
     table = means_table([*paired, *lines], ["method"], "n", QUANTITIES)
     losses = losses_table(paired, [SAME_N], QUANTITIES, ["n"])
     losses_at_bits = losses_table(equal, [EQUAL_BITS], DECODED, ["n"])
-    question = "When do label maps pay that are found in the image itself?"
+    question = "What do automatic label maps gain?"
     return Page(question, answer, "maps.png", table, join_tables(losses, losses_at_bits), METHOD, gains)

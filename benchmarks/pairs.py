@@ -179,7 +179,7 @@ def page(folder: Path, rows: list[Row]) -> Page:
         balances = {image: sum(map(_sign, votes)) for (name, image), votes in by_pair.items() if name == comparison}
         won, lost = (sum(sign * balance > 0 for balance in balances.values()) for sign in (1, -1))
         signs = Counter(map(_sign, group))
-        sentences.append(f"{won} of {len(balances)} ({comparison})")
+        sentences.append(f"{won} of {len(balances)} photos ({comparison})")
         line = [str(comparison), f"{won} of {len(balances)}", str(lost), *(str(signs[sign]) for sign in (1, -1, 0))]
         lines.append(line)
         losses += [(balance, str(comparison), str(image)) for image, balance in balances.items() if balance < 0]
@@ -198,7 +198,8 @@ def page(folder: Path, rows: list[Row]) -> Page:
     question = "Which of two images would viewers rather have in a photo's place?"
     published = f"The hash of the key is `{(folder / 'key.sha256').read_text().split()[0]}`."
     answer = (
-        f"Of the photos, most viewers preferred kcgs to the other on {', '.join(sentences)}."
+        f"Most viewers, all of them vision-language models, preferred kcgs on {', '.join(sentences)}. The other image "
+        "is a WebP or AVIF in as many bytes, or a bicubic enlargement."
         if answers
         else "Nobody has answered yet."
     )

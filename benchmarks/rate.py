@@ -154,9 +154,9 @@ def page(folder: Path, rows: list[Row]) -> Page:
     in_group = [row for row in equal if row["group"] == group]
     answer = (
         f"Files of kcgs for PSNR, without regions, have {own:.2f} dB in {size:,} bytes on {group}. For the same PSNR "
-        f"they need {webp} WebP and {avif} AVIF tuned for PSNR. Files for the eye have a SSIMULACRA2 that is "
-        f"{mean_gain(in_group, eye, 'ssimulacra2', CASES):+.1f} from AVIF's with as many bytes, better in "
-        f"{count_wins(in_group, eye, 'ssimulacra2', CASES)} files; what viewers prefer is in the report of `pairs`."
+        f"they need {webp} WebP and {avif} AVIF tuned for PSNR. Against AVIF with as many bytes, the "
+        f"SSIMULACRA2 of files for the eye is {mean_gain(in_group, eye, 'ssimulacra2', CASES):+.1f}, and better in "
+        f"{count_wins(in_group, eye, 'ssimulacra2', CASES)} files. What viewers prefer is in the report of `pairs`."
     )
     printed = [
         {"group": "Kodak, as printed", "method": method, "target_bytes": size, "psnr": psnr}

@@ -148,8 +148,8 @@ def page(folder: Path, rows: list[Row]) -> Page:
     error, stiff_error = (max(values_of(part, "image_error"), default=math.nan) for part in (default, stiff))
     answer = (
         f"Forward and backward, `cpu` is {one} as fast as `tiled` on one core, and {two} as fast on two cores as on "
-        f"one. Its largest error at the default cutoff is {error:.1g}; of Gaussians up to a million times longer than "
-        f"wide, without a cutoff, {stiff_error:.1g}."
+        f"one. Its largest error is {error:.1g} at the default cutoff, and {stiff_error:.1g} without a cutoff, even of "
+        "Gaussians a million times longer than wide."
     )
     columns = ("forward_ms", "both_ms", "times as fast on 2 cores", "image_error", "gradient_error", "peak_MB")
     one_thread = [row for row in default if row["threads"] == 1]

@@ -14,16 +14,11 @@ REPORTS = Path(__file__).parent / "reports"
 LINK = "../benchmarks/reports"
 HEAD = """# Results
 
-Each answer comes from a report of one page, with a table, what loses, and the command that measures it anew. All but
-those that say so were measured with one tree of `kcgs/`, `{tree}`. Later changes concern GPUs,
-compilation and messages: on a CPU, results are the same bits.
-
-```sh
-python -m benchmarks quality -o report --data DATA --workers 2
-```
-
-`DATA` has the folders `DAVIS`, `bsds`, `kodak` and `cocostuff`; without it photos of scikit-image are measured.
-`--only` chooses images. What is measured is kept in `report/runs`, so the same command goes on where it was stopped.
+Each answer links to a report of one page: its table, its losses, and its command. All but those that say so were
+measured with one tree of `kcgs/`, `{tree}`. Later changes concern GPUs, compilation and messages: on a CPU, results are
+the same bits. `python -m benchmarks quality -o report --data DATA --workers 2` measures the first anew, and goes on
+where it was stopped. `DATA` has the folders `DAVIS`, `bsds`, `kodak` and `cocostuff`; without it photos of scikit-image
+are measured. `--only` chooses images.
 """
 TAIL = """
 ## How figures are taken

@@ -93,8 +93,8 @@ def page(folder: Path, rows: list[Row]) -> Page:
     )
     answer = (
         f"The fit of a video has {psnr:+.2f} dB PSNR and {ef_psnr:+.2f} dB EF-PSNR against fits of "
-        f"its frames alone, and is {times[0] / times[1]:.1f} times as fast. It flickers by {flickers[1]:.2f} levels, "
-        f"those by {flickers[0]:.2f}. Only its Gaussians can be followed from frame to frame."
+        f"its frames alone, and is {times[0] / times[1]:.1f} times as fast. Flicker is {flickers[1]:.2f} of 255 "
+        f"levels, against {flickers[0]:.2f}. Only its Gaussians can be followed from frame to frame."
     )
     table = means_table(rows, ["image", "method"], "", QUANTITIES)
     losses = losses_table(rows, [COMPARISON], QUANTITIES, [])
