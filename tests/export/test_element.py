@@ -200,7 +200,7 @@ class TestEdits:
         page.evaluate(f"(image.move([{first}, {second}], 11, -7), 1)")
         moved = move_region(scene, [first, second], (11, -7), fill=False)
         check(page, moved.render())
-        page.evaluate(f"(image.recolour({first}, [0.5, 1, -1], [0.1, 0, 0.9]), 1)")
+        page.evaluate(f"(image.recolor({first}, [0.5, 1, -1], [0.1, 0, 0.9]), 1)")
         check(page, recolor_region(moved, first, [0.5, 1, -1], [0.1, 0.0, 0.9]).render())
         page.evaluate("(image.reset(), 1)")
         check(page, scene.render())
@@ -210,7 +210,7 @@ class TestEdits:
         [
             ("hide(77)", "ids must be of the scene's regions; got 77"),
             ("move(5, 0.3, 0)", "dx and dy must be whole; got 0.3, 0"),
-            ("recolour(5, [1, 2])", "gain must be a number or 3 of them; got 1,2"),
+            ("recolor(5, [1, 2])", "gain must be a number or 3 of them; got 1,2"),
             ("zoomBy(-1)", "factor must be 0 or more; got -1"),
             ("toBlob({width: 0.5})", "width must be a whole number of pixels, 1 or more; got 0.5"),
             ("toBlob({width: 1e5, height: 1e5})", "no image of 100000 x 100000 can be made"),

@@ -12,7 +12,7 @@ export type Edit = (scene: Scene) => Scene;
 const FLAT_SIGMA = 1e3; // standard deviation of a flat Gaussian, in sides of the image
 
 /** Colours times `gain`, a number or one for each channel, plus `bias`, exactly so in the image. */
-export function recolour(regions: ReadonlySet<number>, gain: Channels, bias: Channels | null): Edit {
+export function recolor(regions: ReadonlySet<number>, gain: Channels, bias: Channels | null): Edit {
   return (scene) => {
     const { channels, count, positions } = scene;
     const factors = spread("gain", gain, channels);

@@ -7,7 +7,7 @@ import type { Glide } from "./gestures.ts";
 import type { Transform } from "./view.ts";
 import { oneOf } from "./attribute.ts";
 import { listenToClicks } from "./clicks.ts";
-import { move, recolour } from "./edits.ts";
+import { move, recolor } from "./edits.ts";
 import type { Channels, Edit } from "./edits.ts";
 import { imageFile, imageSize } from "./image_file.ts";
 import type { ImageOptions } from "./image_file.ts";
@@ -130,8 +130,8 @@ export class KcgsImage extends HTMLElement {
   }
 
   /** Multiply the colours of regions by `gain`, a number or one for each channel, and add `bias`. */
-  recolour(ids: Ids, gain: Channels, bias: Channels | null = null): void {
-    this.edit(recolour(this.positionsOf(ids), gain, bias));
+  recolor(ids: Ids, gain: Channels, bias: Channels | null = null): void {
+    this.edit(recolor(this.positionsOf(ids), gain, bias));
   }
 
   /** Show the scene as the file has it: nothing hidden, moved or recoloured. */
