@@ -51,32 +51,34 @@ class FitConfig(BaseModel):
     # The Gaussians
     initializer: Literal["uniform", "random", "gradient"] = Field(
         "uniform",
-        description="where the first centres are; uniform: anywhere, in the colours of the image; random: anywhere, in "
-        "any colours; gradient: where the image changes, as Image-GS",
+        description="where the first centres are; uniform: anywhere, with the image's colours; random: anywhere, with "
+        "random colours; gradient: where the image changes, as Image-GS",
     )
     densify: Literal["matching-pursuit", "largest-error"] = Field(
         "matching-pursuit", description="where Gaussians are added; largest-error: as Image-GS"
     )
-    densify_from: float = Field(
-        0.01, gt=0.0, le=1.0, description="fraction of N at the start, the others are added; 1: all"
+    densify_from: float = Field(0.01, gt=0.0, le=1.0, description="fraction of N at the start; the rest is added later")
+    warmup: bool = Field(
+        False, description="in the first half of the fit, Gaussians take the region ids under their centres"
     )
-    warmup: bool = Field(False, description="read the region ids again under the moving centres for half of the fit")
     prune: float = Field(1e-3, ge=0.0, description="remove Gaussians that change no value by more, at the end; 0: none")
 
     # Contours
     move_contours: bool = Field(True, description="let contours leave the user's map")
     max_move: float | Literal["any"] = Field(
         3.0,
-        description="how far a contour may move from the user's map, in pixels, at least 1; any: as far as it likes",
+        description="how far a contour may move from the user's map, in pixels, at least 1; any: no limit",
     )
     contour_cost: float = Field(0.003, ge=0.0, description="squared error that a pixel of contour must save")
-    merge_regions: bool = Field(True, description="merge those most alike where there are more regions than Gaussians")
+    merge_regions: bool = Field(
+        True, description="merge the most similar regions if there are more regions than Gaussians"
+    )
 
     # The descent
     objective: Objective = Field(
         "auto",
-        description="psnr: lower what `loss` says; ms-ssim: raise MS-SSIM, which needs loss l2; auto: ms-ssim for a "
-        "file of so many bytes, else psnr",
+        description="psnr: minimize `loss`; ms-ssim: maximize MS-SSIM, with loss l2; auto: ms-ssim for a file of a "
+        "given size, else psnr",
     )
     loss: Literal["l1", "l2", "l1+ssim"] = Field("l2", description="l1+ssim: L1 + 0.1 (1 - SSIM), as Image-GS")
     optimizer: Literal["gaussian-adam", "adan", "adam"] = Field(
@@ -92,12 +94,12 @@ class FitConfig(BaseModel):
     iterations: int | None = Field(
         None,
         ge=1,
-        description="None: 700, or with `max_seconds` as many as there is time for",
+        description="None: 700, or with `max_seconds` as many as the time allows",
     )
     max_seconds: float | None = Field(
         None,
         gt=0.0,
-        description="about how long a fit may take; progress is the share of it, or of the iterations, that is over",
+        description="time of a fit, about; its schedule then follows the time, not the iterations",
     )
     target_psnr: float | None = Field(
         None, gt=0.0, description="the fewest Gaussians that reach this PSNR (dB), by a search over several fits"
