@@ -99,7 +99,7 @@ class FitConfig(BaseModel):
     max_seconds: float | None = Field(
         None,
         gt=0.0,
-        description="time of a fit, about; its schedule then follows the time, not the iterations",
+        description="seconds that a fit may take, about; its schedule then follows the time, not the iterations",
     )
     target_psnr: float | None = Field(
         None, gt=0.0, description="the fewest Gaussians that reach this PSNR (dB), by a search over several fits"
