@@ -65,10 +65,10 @@ def encode_labels(labels: Tensor | NDArray[Any]) -> bytes:
 def _encode_smallest(ids: Integers, index: NDArray[Any]) -> tuple[int, bytes]:
     """Write the stream of a map, turned so that it takes few bytes; return the turn, too."""
     from .labels.stream import encode_stream  # loads numba
-    from .labels.wavefront import survey
+    from .labels.wavefront import number_regions
 
     # the fewer seeds, the smaller the stream, as a rule
-    seeds = [int(survey(turned(index, turn), len(ids))[1].sum()) for turn in range(_TURNS)]
+    seeds = [int(number_regions(turned(index, turn), len(ids))[1].sum()) for turn in range(_TURNS)]
     fewest = sorted(range(_TURNS), key=seeds.__getitem__)[:_TRIED_TURNS]
     turns = [turn for turn in fewest if seeds[turn] <= min(seeds) + _SEED_MARGIN]
     streams = [(turn, encode_stream(ids, turned(index, turn), is_file=True)) for turn in turns]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -14,6 +13,7 @@ from torch import Tensor
 
 from kcgs._check import check_floating, check_number
 from kcgs._image import LUMA
+from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
@@ -77,7 +77,7 @@ def move_region(scene: Scene, region_ids: int | Iterable[int], offset: Sequence[
 
     lost_ids = regions.ids[~torch.isin(regions.ids, labels)].tolist()
     if lost_ids:
-        warnings.warn(f"regions {', '.join(map(str, lost_ids))} are lost: covered, or out of the image", stacklevel=2)
+        warn_user(f"regions {', '.join(map(str, lost_ids))} are lost: covered, or out of the image")
 
     field = scene.field
     if fill and (hole & ~landing).any():

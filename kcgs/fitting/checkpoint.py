@@ -26,8 +26,8 @@ from .state import FitState
 # a checkpoint is written when the fit has run this many times as long as the last one took to write
 _RUN_PER_WRITE = 100.0
 _VERSION = 6
-# all fields of the state that are numbers
-_NUMBERS = [field.name for field in fields(FitState) if field.type in ("int", "float")]
+# all fields of the state that are numbers or flags
+_NUMBERS = [field.name for field in fields(FitState) if field.type in ("bool", "int", "float")]
 
 
 class Checkpoint:

@@ -85,7 +85,7 @@ class MsSsimObjective:
             self._passes = Passes(scales, factors, _MIN_SCORE)  # the compiled form of `_measure`
 
     def apply(self, difference: Tensor) -> Tensor:
-        """Return half the gradient of E, (C, H, W), at a difference r, render - image, in whose memory it may be.
+        """Return half the gradient of E, (C, H, W), at a difference r, render - image, which it may overwrite.
 
         Where the mean of a scale is below 0.2, E takes it as 0.2, and the slope of its logarithm is 1 / 0.2.
         """

@@ -53,12 +53,12 @@ def differentiate(arguments: SplatArguments, plan: Plan, grad: Tensor, geometry:
     return means.squeeze(0), cholesky.squeeze(0), colors.squeeze(0)
 
 
-def descend(arguments: SplatArguments, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def error_gradients(arguments: SplatArguments, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the gradients of half the squared error, summed over the pixels, against an image of the same shape."""
     plan = plan_splat(arguments)
-    if plan.steps.descend is None:
+    if plan.steps.error_gradients is None:
         return differentiate(arguments, plan, render(arguments, plan) - target, True)
-    means, cholesky, colors = plan.steps.descend(plan.content, plan.inputs, target)
+    means, cholesky, colors = plan.steps.error_gradients(plan.content, plan.inputs, target)
     assert means is not None and cholesky is not None
     return means, cholesky, colors
 

@@ -10,7 +10,7 @@ from kcgs.kernels import check_backend
 
 from .arguments import SplatArguments
 from .decomposition import decompose
-from .evaluation import descend
+from .evaluation import error_gradients
 from .map_tables import MapOperands
 from .operator import splat_operator
 from .regions import RegionMap, map_operands
@@ -134,7 +134,8 @@ def squared_error_gradients(
     operands = None if regions is None else map_operands(regions)
     labels, softness = (None, None) if operands is None else operands[:2]
     gaussians = means.detach(), cholesky.detach(), colors.detach()
-    return descend(SplatArguments(*gaussians, region_ids, labels, softness, height, width, cutoff, backend), image)
+    arguments = SplatArguments(*gaussians, region_ids, labels, softness, height, width, cutoff, backend)
+    return error_gradients(arguments, image)
 
 
 def _check_gaussians(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:

@@ -15,7 +15,7 @@ Gradients = tuple[Tensor | None, Tensor | None, Tensor]
 
 
 class SplatInputs(NamedTuple):
-    """Arguments of one splat, checked and batched by the public function.
+    """Arguments of one splat, checked and batched unless the kernel does so itself (`checks_inputs`).
 
     Floating tensors share one dtype (float32 or float64) and one device.
     """
@@ -41,15 +41,15 @@ class SplatInputs(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """A kernel as three functions, none of which records a graph.
+    """A kernel: three functions that record no graph, and three optional fields.
 
     plan: from the inputs to which Gaussians touch which pixels, in a form of the kernel's own.
     render: from (plan, inputs) to the image, (B, C, H, W).
     differentiate: from (plan, inputs, gradient of the image, geometry) to the gradients of means, cholesky and colors;
         the first two are None unless `geometry`.
     image: from the inputs to the image, with a graph of all orders; None: the kernel is differentiable once.
-    descend: from (plan, inputs, target) to the gradients of half the squared error against the target, (B, C, H, W), in
-        one pass; None: there is none.
+    error_gradients: from (plan, inputs, target) to the gradients of half the squared error against the target,
+        (B, C, H, W), in one pass; None: there is none.
     checks_inputs: `plan` returns None where a value is not finite or beyond the limits in whitened.py, and Gaussians of
         one image may come without B, as do the results then; else values have been checked, and B is there.
     """
@@ -58,7 +58,7 @@ class Steps(NamedTuple):
     render: Callable[[Any, SplatInputs], Tensor]
     differentiate: Callable[[Any, SplatInputs, Tensor, bool], Gradients]
     image: Callable[[SplatInputs], Tensor] | None = None
-    descend: Callable[[Any, SplatInputs, Tensor], Gradients] | None = None
+    error_gradients: Callable[[Any, SplatInputs, Tensor], Gradients] | None = None
     checks_inputs: bool = False
 
 

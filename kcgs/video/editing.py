@@ -61,15 +61,15 @@ def delete_region(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
         new_regions = regions.relabel(labels, "mean")
         for t, scene in enumerate(scenes):
             means, cholesky, colors, _, _ = Splats.of(scene)
-            region_ids = torch.where(deleted_rows[t], new_regions.image(t).ids[0], row_ids[t])
+            ids = torch.where(deleted_rows[t], new_regions.image(t).ids[0], row_ids[t])
             colors[deleted_rows[t]] = 0.0
             if t:  # rows that filled the frame before go on
                 rows, before = deleted_rows[t] & deleted_rows[t - 1], frames[-1]
                 means[rows] = apply_affine(motions[t] @ motions[t - 1].inverse(), before.means[rows])
                 cholesky[rows], colors[rows] = before.cholesky[rows], before.colors[rows]
                 if before.region_ids is not None:
-                    region_ids[rows] = before.region_ids[rows]
-            start = Splats(means, cholesky, colors, region_ids, new_regions.image(t))
+                    ids[rows] = before.region_ids[rows]
+            start = Splats(means, cholesky, colors, ids, new_regions.image(t))
             movable_rows, changed_pixels = torch.ones_like(deleted_rows[t]), torch.ones_like(deleted_pixels[t])
             unused = deleted_rows[t] & (colors == 0).all(-1)
             descent = FrameDescent(Target(images[t], config), start, movable_rows, changed_pixels)

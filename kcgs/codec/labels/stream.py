@@ -12,7 +12,7 @@ from kcgs.codec.rangecoder import Reader, Writer
 
 from .ids import code_ids
 from .pixels import WorkLimitError, code_pixels
-from .wavefront import survey
+from .wavefront import number_regions
 
 _NOISE_CHANCE = np.array([2.0**-10])  # that a map is coded as noise
 _NOISE_OVERHEAD = 64  # bits by which the model may exceed noise
@@ -23,7 +23,7 @@ def encode_stream(ids: Integers, index: Any, *, is_file: bool) -> bytes:
 
     `is_file` says whether the map is a file of its own, or that of a scene, which has other models.
     """
-    truth, seeds, order = survey(index, len(ids))
+    truth, seeds, order = number_regions(index, len(ids))
     numbered = ids[order].tolist()
     writer = _start(numbered, is_file, is_noise=False)
     if len(ids) == 1:

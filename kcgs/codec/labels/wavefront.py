@@ -250,7 +250,7 @@ def find_nearest(labels, pixel, nearest):  # type: ignore[no-untyped-def]
 
 
 @program.entry
-def survey(index, num_regions):  # type: ignore[no-untyped-def]
+def number_regions(index, num_regions):  # type: ignore[no-untyped-def]
     """Number the regions as wavefronts meet them, and mark seeds.
 
     Returns the number of each pixel's region, the seeds, and the position of each numbered region in `index`.

@@ -36,7 +36,7 @@ def steps(inputs: SplatInputs) -> Steps:
         raise ValueError(f"backend 'cpu' computes in float32; got {inputs.means.dtype}: use 'tiled' or 'reference'")
     if inputs.means.device.type != "cpu":
         raise ValueError(f"backend 'cpu' needs tensors on the CPU; got {inputs.means.device}")
-    return Steps(plan, render, differentiate, descend=descend, checks_inputs=True)
+    return Steps(plan, render, differentiate, error_gradients=error_gradients, checks_inputs=True)
 
 
 def plan(inputs: SplatInputs) -> Lists | None:
@@ -127,7 +127,7 @@ def differentiate(lists: Lists, inputs: SplatInputs, grad: Tensor, geometry: boo
     return (means, cholesky, colors) if geometry else (None, None, colors)
 
 
-def descend(lists: Lists, inputs: SplatInputs, target: Tensor) -> Gradients:
+def error_gradients(lists: Lists, inputs: SplatInputs, target: Tensor) -> Gradients:
     """Return the gradients of half the squared error, summed over the pixels, against (B, C, H, W)."""
     return _gather(lists, inputs, target, ADDS | GATHERS)
 
