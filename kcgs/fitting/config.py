@@ -38,7 +38,9 @@ class FitConfig(BaseModel):
     # The model
     guidance: bool = Field(True, description="confine Gaussians to regions, where regions are given")
     clamp: bool | Literal["auto"] = Field(
-        "auto", description="clip the render to [0, 1] in training; auto: if a quarter of the image's values are 0 or 1"
+        "auto",
+        description="clip the render to [0, 1] in training; auto: only where the image is 0 or 1, if a quarter of its "
+        "values are",
     )
     softness: float | Literal["auto"] = Field(
         "auto",

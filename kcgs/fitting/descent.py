@@ -28,7 +28,8 @@ def render(state: FitState, scene: Scene | None = None) -> Tensor:
         field.means, field.cholesky, field.colors, field.region_ids, scene.regions,
         size=size, cutoff=state.cutoff, backend=config.backend,
     )  # fmt: skip
-    return rendered.clamp(0.0, 1.0) if state.problem.clamp else rendered
+    bounds = state.problem.bounds
+    return rendered if bounds is None else rendered.clamp(*bounds)
 
 
 def squared_error(state: FitState, regions: RegionMap | None = None) -> Tensor:
@@ -45,7 +46,7 @@ def backward(state: FitState, rendered: Tensor | None) -> None:
     """
     problem, field = state.problem, state.scene.field
     config, image = problem.config, problem.image
-    if rendered is None and config.loss == "l2" and problem.objective is None and not problem.clamp:
+    if rendered is None and config.loss == "l2" and problem.objective is None and problem.bounds is None:
         field.means.grad, field.cholesky.grad, field.colors.grad = squared_error_gradients(
             image, field.means, field.cholesky, field.colors, field.region_ids, state.scene.regions,
             cutoff=state.cutoff, backend=config.backend,

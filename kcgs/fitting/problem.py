@@ -18,7 +18,7 @@ from kcgs.functional.regions import as_region_map
 from .config import FitConfig
 from .objective import MsSsimObjective, make_objective
 
-# share of an image's values that are 0 or 1 from which on `clamp="auto"` clips the render: Gaussians may overshoot
+# share of an image's values that are 0 or 1 from which on `clamp="auto"` lets Gaussians overshoot them
 _SATURATED_SHARE = 0.25
 
 
@@ -43,11 +43,18 @@ class Problem:
         return self.image.shape[1], self.image.shape[2]
 
     @cached_property
-    def clamp(self) -> bool:
-        """True where the render is clipped to [0, 1] in training."""
-        if self.config.clamp != "auto":
-            return self.config.clamp
-        return float(((self.image == 0.0) | (self.image == 1.0)).float().mean()) >= _SATURATED_SHARE
+    def bounds(self) -> tuple[Tensor, Tensor] | None:
+        """The values to which the render is clipped in training, if it is: two tensors (C, H, W), or scalars.
+
+        A clipped value has no gradient, even where it is wrong. So `clamp="auto"` clips at 0 only where the image is 0,
+        and at 1 only where it is 1.
+        """
+        if self.config.clamp == "auto":
+            black, white = self.image == 0.0, self.image == 1.0
+            if float((black | white).float().mean()) < _SATURATED_SHARE:
+                return None
+            return torch.where(black, 0.0, -torch.inf), torch.where(white, 1.0, torch.inf)
+        return (self.image.new_zeros(()), self.image.new_ones(())) if self.config.clamp else None
 
     @cached_property
     def band(self) -> Tensor:

@@ -13,6 +13,7 @@ from kcgs import FitConfig, GaussianField, RegionMap, fit
 from kcgs.data import chart_2x3, chart_pie
 from kcgs.fitting import available_recipes
 from kcgs.fitting.optimizers import ImageGSAdam
+from kcgs.fitting.problem import make_problem
 from kcgs.functional import ef_psnr, psnr
 from tests.conftest import Clock
 
@@ -170,12 +171,16 @@ class TestSwitches:
 
     def test_clamp_of_saturated_pictures(self) -> None:
         image, labels = disc()
-        for picture in (image.clamp(0.1, 0.9), (image > 0.5).float()):
-            by_share, by_hand = (
-                fit(picture, labels, 8, recipe=quick(clamp=c)).scene.field.colors
-                for c in ("auto", bool(picture.max() == 1))
-            )
-            assert torch.equal(by_share, by_hand)
+        for picture, is_saturated in ((image.clamp(0.1, 0.9), False), ((image > 0.5).float(), True)):
+            auto, free = (fit(picture, labels, 8, recipe=quick(clamp=c)).scene.field.colors for c in ("auto", False))
+            assert torch.equal(auto, free) != is_saturated
+
+    def test_values_overshoot_only_where_the_image_is_saturated(self) -> None:
+        image = torch.tensor([0.0, 1.0, 0.5, 0.5]).expand(1, 6, 4)
+        bounds = make_problem(image, None, 1, FitConfig(), 0).bounds
+        assert bounds is not None
+        for outside, clipped in ((2.0, [2.0, 1.0, 2.0, 2.0]), (-1.0, [0.0, -1.0, -1.0, -1.0])):
+            assert torch.equal(torch.full((1, 6, 4), outside).clamp(*bounds), torch.tensor(clipped).expand(1, 6, 4))
 
     @pytest.mark.parametrize("loss", ["l1", "l2"])
     @pytest.mark.parametrize("optimizer", ["adam", "adan"])
