@@ -198,7 +198,7 @@ def page(folder: Path, rows: list[Row]) -> Page:
     question = "Which of two images would viewers rather have in a photo's place?"
     published = f"The hash of the key is `{(folder / 'key.sha256').read_text().split()[0]}`."
     answer = (
-        f"Most viewers, all of them vision-language models, preferred kcgs on {', '.join(sentences)}. The other image "
+        f"Most viewers preferred kcgs on {', '.join(sentences)}. The other image "
         "is a WebP or AVIF in as many bytes, or a bicubic enlargement."
         if answers
         else "Nobody has answered yet."
