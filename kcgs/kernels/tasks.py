@@ -16,7 +16,9 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -33,6 +35,9 @@ START = 0  # tasks that must be done before
 _TAKEN = 0
 _DONE = 1
 
+# of both counters, when a task has failed
+_CANCELLED = 1 << 62
+
 _MOST_RANGES = 256
 
 # times that a thread yields before it sleeps, so that one that was interrupted finds a processor
@@ -41,13 +46,34 @@ _MICROSECONDS = 20  # of a sleep
 
 
 def run_tasks(function: Callable[[Any, Any], None], tasks: Any, *, serial: bool = False) -> None:
-    """Call function(tasks, counters) on this thread and, unless `serial`, on others; return when all is done."""
+    """Call function(tasks, counters) on this thread and, unless `serial`, on others; return when all is done.
+
+    An exception in one thread ends the others after their present tasks, and reaches the caller.
+    """
     counters = np.zeros(2, np.int64)
-    threads = 1 if serial else min(num_threads(), len(tasks))
-    for _ in range(threads - 1):
-        # one that starts too late finds nothing to do, so nobody waits for it
-        _pool(os.getpid(), num_threads() - 1).submit(function, tasks, counters)
-    function(tasks, counters)
+    run = partial(_run_or_cancel, function, tasks, counters)
+    others: list[Future[None]] = []
+    # one that starts too late finds nothing to do, so nobody waits for it
+    with suppress(RuntimeError):  # while the interpreter ends, there are no other threads
+        for _ in range(0 if serial else min(num_threads(), len(tasks)) - 1):
+            others.append(_pool(os.getpid(), num_threads() - 1).submit(run))
+    try:
+        run()
+    finally:
+        if counters[_DONE] >= _CANCELLED:
+            wait(others)  # they still write to what the caller is about to give up
+    if counters[_DONE] >= _CANCELLED:
+        for other in others:
+            other.result()
+
+
+def _run_or_cancel(function: Callable[[Any, Any], None], tasks: Any, counters: Any) -> None:
+    """Run tasks; where one fails, end the waiting of other threads, and their work."""
+    try:
+        function(tasks, counters)
+    except BaseException:
+        counters[:] = _CANCELLED
+        raise
 
 
 @functools.cache
@@ -146,11 +172,11 @@ def _wait(counters, count):  # type: ignore[no-untyped-def]
 
 @inner
 def first_task(tasks, counters):  # type: ignore[no-untyped-def]
-    """Take a task, and wait for those before it; return its number, or -1 when all are done."""
+    """Take a task, and wait for those before it; return its number, or -1 when all are done or one has failed."""
     k: int = _add(counters, _TAKEN)  # type: ignore[call-arg]
     if k < len(tasks):
         _wait(counters, tasks[k, START])
-        return k
+        return -1 if _read(counters, _DONE) >= _CANCELLED else k  # type: ignore[call-arg]
     _wait(counters, len(tasks))
     return -1
 

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
-from kcgs import GaussianField, Scene
+from kcgs import GaussianField, Scene, load
 from kcgs.editing import delete_region, move_region
 from kcgs.kernels import threads_for_kernels
+from kcgs.kernels.compiled import Program
+from kcgs.kernels.tasks import first_task, next_task, phases, run_tasks
 from kcgs.kernels.threads import num_threads
 from kcgs.rate import compress
 from kcgs.segment import segment
@@ -68,3 +75,57 @@ class TestThreads:
         monkeypatch.setattr(import_module(module), inner, record)
         work()
         assert set(threads) == {(1, 3)} and torch.get_num_threads() == 3
+
+
+_program = Program("tasks of a test", __file__)
+
+
+@_program.entry
+def fail_at(failing: int, done: Any, tasks: Any, counters: Any) -> None:
+    k = first_task(tasks, counters)
+    while k >= 0:
+        if k == failing:
+            raise ValueError("a task fails")
+        done[k] = True
+        k = next_task(tasks, counters)
+
+
+@pytest.mark.usefixtures("three_threads")
+class TestTasks:
+    @pytest.mark.parametrize("failing", [0, 3, 7])
+    def test_failure(self, failing: int) -> None:
+        """A task that fails, on whichever thread, ends the call by its exception, and no later phase begins."""
+        tasks = phases(*(np.zeros((2, 1), np.int64) for _ in range(4)))
+        for _ in range(50):
+            done = np.zeros(len(tasks), np.bool_)
+            with pytest.raises(ValueError, match="a task fails"):
+                run_tasks(partial(fail_at, failing, done), tasks)
+            assert not done[failing] and not done[2 * (failing // 2 + 1) :].any()
+        done = np.zeros(len(tasks), np.bool_)
+        run_tasks(partial(fail_at, -1, done), tasks)
+        assert done.all()
+
+
+AT_EXIT = """
+import atexit, sys, threading
+import torch
+from kcgs import GaussianField, Scene, fit
+
+torch.set_num_threads(3)
+labels = (torch.arange(64) >= 20).long().expand(48, 64)
+scene = Scene(GaussianField.random(400, (48, 64), regions=labels, seed=0), labels)
+
+def work():
+    threading.main_thread().join()
+    fit(torch.rand(3, 48, 64), labels, 40, iterations=20).scene.save(sys.argv[1])
+
+atexit.register(lambda: print("at exit", tuple(scene.render().shape)))
+threading.Thread(target=work).start()
+"""
+
+
+def test_work_outlives_the_main_thread(tmp_path: Path) -> None:
+    path = tmp_path / "scene.safetensors"
+    done = subprocess.run([sys.executable, "-c", AT_EXIT, str(path)], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert load(path).num_gaussians <= 40 and done.stdout == "at exit (3, 48, 64)\n"
