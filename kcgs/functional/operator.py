@@ -67,24 +67,24 @@ class _Splat(torch.autograd.Function):
             image, ctx.plan = _unrecorded(splat_operator, *arguments), None
         ctx.save_for_backward(*arguments[:3])
         ctx.save_for_forward(*arguments[:3])
-        # a graph would not save what was made in inference mode, which ids and labels may be
-        ctx.constants = arguments[3:]
+        _keep_constants(ctx, arguments[3:])
         return image
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:
         gaussians = ctx.saved_tensors
-        image: Tensor = _forward_operator(*_filled(tangents[:3], gaussians), *gaussians, *ctx.constants)
+        image: Tensor = _forward_operator(*_filled(tangents[:3], gaussians), *gaussians, *_constants(ctx))
         return image
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         means, cholesky, colors = ctx.needs_input_grad[:3]
-        arguments, geometry = (*ctx.saved_tensors, *ctx.constants), means or cholesky
-        if ctx.plan is not None and _is_plain((grad, *arguments[:3])) and not torch.is_grad_enabled():
-            gradients = below_autograd(differentiate, SplatArguments(*arguments), ctx.plan, grad, geometry)
+        gaussians, geometry = ctx.saved_tensors, means or cholesky
+        if ctx.plan is not None and _is_plain((grad, *gaussians)) and not torch.is_grad_enabled():
+            arguments = SplatArguments(*gaussians, *ctx.constants)
+            gradients = below_autograd(differentiate, arguments, ctx.plan, grad, geometry)
         else:
-            gradients = _backward_operator(grad, *arguments, geometry)
+            gradients = _backward_operator(grad, *gaussians, *_constants(ctx), geometry)
         if not is_graph_retained():
             ctx.plan = None  # as torch frees what is saved: a loss that stays alive holds no plan
         needed = zip(gradients, (means, cholesky, colors), strict=True)
@@ -119,7 +119,7 @@ class _SplatForward(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> Tensor:
         ctx.save_for_backward(*arguments[:6])
-        ctx.constants = arguments[6:]
+        _keep_constants(ctx, arguments[6:])
         image: Tensor = _unrecorded(_forward_operator, *arguments)
         return image
 
@@ -130,8 +130,9 @@ class _SplatForward(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         tangents, gaussians = ctx.saved_tensors[:3], ctx.saved_tensors[3:]
-        first = _backward_operator(grad, *gaussians, *ctx.constants, True)
-        second = _double_backward_operator(*tangents, grad, *gaussians, *ctx.constants, True)[1:]
+        constants = _constants(ctx)
+        first = _backward_operator(grad, *gaussians, *constants, True)
+        second = _double_backward_operator(*tangents, grad, *gaussians, *constants, True)[1:]
         return (*first, *second, *[None] * 7)
 
 
@@ -147,6 +148,28 @@ class _SplatDoubleBackward(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         raise RuntimeError(_THIRD)
+
+
+def _keep_constants(ctx: Any, constants: tuple[Any, ...]) -> None:
+    """Keep ids, labels and settings for a backward, which torch would not save if they were made in inference mode."""
+    ctx.constants, ctx.versions = constants, _versions(constants)
+
+
+def _constants(ctx: Any) -> tuple[Any, ...]:
+    """Return what was kept; refuse ids and labels that were written to since, as torch does for what it saves."""
+    constants: tuple[Any, ...] = ctx.constants
+    for name, version, expected in zip(("region_ids", "regions"), _versions(constants), ctx.versions, strict=True):
+        if version != expected:
+            raise RuntimeError(
+                "one of the variables needed for gradient computation has been modified by an inplace operation: "
+                f"{name} of region_splat is at version {version}; expected version {expected} instead"
+            )
+    return constants
+
+
+def _versions(constants: tuple[Any, ...]) -> list[int | None]:
+    """Return how often ids and labels have been written to; None: nobody counts."""
+    return [None if t is None or t.is_inference() else t._version for t in constants[:2]]
 
 
 def _filled(tangents: tuple[Tensor | None, ...], tensors: tuple[Tensor, ...]) -> list[Tensor]:

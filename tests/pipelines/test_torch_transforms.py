@@ -358,6 +358,20 @@ class TestOperator:
         image.sum().backward()
         assert image.grad_fn.plan is None  # a loss that stays alive for its value holds no plan
 
+    @pytest.mark.parametrize("name", ["region_ids", "regions"])
+    @pytest.mark.parametrize("settings", [{"create_graph": True}, {"is_grads_batched": True}])
+    def test_a_backward_that_plans_again_refuses_other_labels(
+        self, field: GaussianField, regions: RegionMap, backend: str, name: str, settings: dict[str, bool]
+    ) -> None:
+        colors = field.colors.detach().clone().requires_grad_()
+        maps = {"region_ids": field.region_ids.clone(), "regions": regions.labels.clone()}
+        image = region_splat(field.means.detach(), field.cholesky.detach(), colors, **maps, backend=backend)
+        grad = torch.ones(2, *image.shape) if "is_grads_batched" in settings else torch.ones_like(image)
+        torch.autograd.grad(image, colors, grad, retain_graph=True, **settings)
+        maps[name].fill_(3)
+        with pytest.raises(RuntimeError, match=f"modified by an inplace operation: {name} of region_splat is at ver"):
+            torch.autograd.grad(image, colors, grad, **settings)
+
 
 class TestFunctional:
     def test_functional_call(self, field: GaussianField, regions: RegionMap, backend: str) -> None:
