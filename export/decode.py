@@ -76,8 +76,11 @@ def open_decoder(path: Path, providers: Sequence[str], threads: int) -> Decoder:
     idle = [name for name in providers if name not in session.get_providers()]
     if idle:
         raise DecodeError(f"--providers: {', '.join(idle)} did not start here; what did: {session.get_providers()}")
-    notes = session.get_modelmeta().custom_metadata_map
-    return Decoder(path, session, notes, _check_decoder(path, session, notes), load_ms)
+    try:
+        notes = session.get_modelmeta().custom_metadata_map
+        return Decoder(path, session, notes, _check_decoder(path, session, notes), load_ms)
+    except UnicodeDecodeError as error:  # names and notes are texts
+        raise DecodeError(f"{path} is damaged: {error}") from error
 
 
 def _check_decoder(path: Path, session: onnxruntime.InferenceSession, notes: Mapping[str, str]) -> frozenset[str]:

@@ -300,6 +300,13 @@ class TestRefusals:
         path.write_bytes(content)
         refuses(f"onnxruntime cannot load {path}: ", path)
 
+    @pytest.mark.parametrize("text", [b"kcgs.decoder", b"format", b"visible", b"image"])
+    def test_damaged_texts(self, files: Files, refuses: Any, tmp_path: Path, text: bytes) -> None:
+        content, path = files.interactive.read_bytes(), tmp_path / "damaged.onnx"
+        assert text in content
+        path.write_bytes(content.replace(text, b"\xff" * len(text)))
+        refuses(f"(onnxruntime cannot load {path}: |{path} is damaged: .* invalid start byte)", path)
+
     def test_truncated_decoders(self, files: Files, refuses: Any, tmp_path: Path) -> None:
         content = files.interactive.read_bytes()
         rng = random.Random(0)
