@@ -51,7 +51,7 @@ def region_splat(
         size: (height, width); needed without `regions`, else it must equal theirs.
         cutoff: weights below it are skipped, in [0, 1), and wide Gaussians are interpolated between coarse nodes as
             closely; 0 evaluates all at all pixels. Skipping a Gaussian is off by cutoff times its absolute colour at
-            most, interpolating by 1.7 times that: see docs/performance.md.
+            most, interpolating by 3.2 times that: see docs/performance.md.
         backend: auto, reference, tiled, cpu or cuda.
 
     Returns:

@@ -18,7 +18,7 @@ from .tiles import TILE
 # nodes along the longer side of the coarsest grid
 _COARSEST_SIDE = 2 * TILE
 # spacing of nodes, in standard deviations, at cutoff 1; it grows with cutoff^(1/4), so that the error of interpolation,
-# 0.0042 spacing^4, is 1.7 times the cutoff
+# at most spacing^4 / 128, is 3.2 times the cutoff
 _SPACING = 4.5
 # largest spacing of nodes, in standard deviations: a spline has 0.7^2 / 3 = 0.16 of the Gaussian's variance at most
 _MAX_SPACING = 0.7

@@ -249,6 +249,20 @@ class TestAgainstReference:
         assert (result - exact).abs().max() <= 2 * cutoff * overlap
         assert (result - exact).abs().max() > 0
 
+    @pytest.mark.parametrize(
+        ("size", "mean", "cholesky"),
+        [((40, 63), (57.566, 14.5225), (14.115, -15.117, 15.723)), ((128, 128), (65.2, 63.7), (21.2, 0.0, 21.2))],
+    )
+    def test_coarse_grids_reach_their_bound(
+        self, backend: str, size: tuple[int, int], mean: tuple[float, float], cholesky: tuple[float, float, float]
+    ) -> None:
+        """Between nodes the error of a wide Gaussian is 3.2 times the cutoff at most, and more than its half."""
+        scene = torch.tensor([mean]).double(), torch.tensor([cholesky]).double(), torch.ones(1, 1).double()
+        exact = region_splat(*scene, size=size, cutoff=0, backend="reference")
+        result = region_splat(*(t.float() for t in scene), size=size, backend=backend)
+        error = (result - exact).abs().max()
+        assert error <= 3.2e-4 and (backend == "reference" or error > 1.6e-4)
+
     def test_many_gaussians(self, backend: str) -> None:
         scene = random_scene(4000, (70, 90), 4)
         result = region_splat(*as_float32(scene), backend=backend)
