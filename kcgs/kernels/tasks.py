@@ -55,8 +55,8 @@ def run_tasks(function: Callable[[Any, Any], None], tasks: Any, *, serial: bool 
     others: list[Future[None]] = []
     # one that starts too late finds nothing to do, so nobody waits for it
     with suppress(RuntimeError):  # while the interpreter ends, there are no other threads
-        for _ in range(0 if serial else min(num_threads(), len(tasks)) - 1):
-            others.append(_pool(os.getpid(), num_threads() - 1).submit(run))
+        count = 0 if serial else min(num_threads(), len(tasks)) - 1
+        others.extend(_pool(os.getpid(), num_threads() - 1).submit(run) for _ in range(count))
     try:
         run()
     finally:
@@ -176,7 +176,7 @@ def first_task(tasks, counters):  # type: ignore[no-untyped-def]
     k: int = _add(counters, _TAKEN)  # type: ignore[call-arg]
     if k < len(tasks):
         _wait(counters, tasks[k, START])
-        return -1 if _read(counters, _DONE) >= _CANCELLED else k  # type: ignore[call-arg]
+        return -1 if _read(counters, _DONE) >= _CANCELLED else k
     _wait(counters, len(tasks))
     return -1
 
