@@ -43,7 +43,7 @@ def fit_many_command(
     workers: Annotated[int | None, typer.Option(min=1, help="Images at a time; default: cores / --threads.")] = None,
     threads: Annotated[int, typer.Option(min=1, help="Threads of each fit.")] = 1,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace files that were made with other settings.")
+        bool, typer.Option("--overwrite", help="Replace files made with other settings or changed since.")
     ] = False,
     resize_regions: options.ResizeRegions = False,
     quiet: Quiet = False,
@@ -52,8 +52,8 @@ def fit_many_command(
     """Fit many images, each into a scene or a compressed file of its own.
 
     The same command again goes on where an earlier one stopped: a file that was made from the same image, mask and
-    settings is kept; any other file that exists is an error of that image without --overwrite. One image's failure
-    stops no other; with any, the exit status is 1.
+    settings, and not changed since, is kept; any other file that exists is an error of that image without --overwrite.
+    One image's failure stops no other; with any, the exit status is 1.
     """
     if request.target_bytes is not None and suffix == ".safetensors":
         options.exclude("--target-bytes", suffix=suffix)

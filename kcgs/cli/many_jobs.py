@@ -25,7 +25,7 @@ class FitJob(NamedTuple):
     """auto, none, or the mask."""
     request: FitRequest
     overwrite: bool = False
-    """Replace a scene of another image, mask or settings."""
+    """Replace a scene of another image, mask or settings, or one that was changed since."""
     resize_regions: bool = False
 
 
@@ -40,19 +40,22 @@ class Outcome(NamedTuple):
 
 
 def fit_one(job: FitJob) -> Outcome:
-    """Fit an image, write its scene and its row, unless they are there; an error is returned."""
+    """Fit an image, write its scene and its row, unless they are there unchanged; an error is returned."""
     from kcgs.data import load_image
 
     record = job.output.with_suffix(".json")
     try:
         fingerprint = _fingerprint(job)
         if job.output.is_file():
-            row = json.loads(record.read_text(encoding="utf-8")) if record.is_file() else {}
+            row = _read_row(record)
+            checksum = row.pop("checksum", None)
             is_same = row.get("fingerprint") == fingerprint
-            if is_same and "psnr" in row:
+            if is_same and checksum == _checksum(job.output, row):
                 return Outcome(row, False)
-            if not (is_same or job.overwrite):
-                raise FileExistsError(f"{job.output} exists, made with other settings; --overwrite replaces it")
+            is_unfinished = is_same and checksum is None
+            if not (is_unfinished or job.overwrite):
+                problem = "made with other settings or changed since"
+                raise FileExistsError(f"{job.output} exists, {problem}; --overwrite replaces it")
         # a warning of one image among many must say which image: the caller does
         with warnings.catch_warnings(record=True) as messages:
             warnings.simplefilter("always", UserWarning)
@@ -63,10 +66,24 @@ def fit_one(job: FitJob) -> Outcome:
             saved_fit = fit_and_save(job.output, image, labels, job.request)
             report = report_fit(saved_fit, image, labels, job.output, job.request)
             row = {**replace_undefined(report), "fingerprint": fingerprint}
-        write_file(record, json.dumps(row))
+        write_file(record, json.dumps({**row, "checksum": _checksum(job.output, row)}))
         return Outcome(row, True, tuple(str(message.message) for message in messages))
     except Exception as error:
         return Outcome({"error": describe_error(error)}, True)
+
+
+def _read_row(record: Path) -> dict[str, Any]:
+    """Read the row beside a scene; it is empty if there is none that can be read."""
+    try:
+        row: dict[str, Any] = json.loads(record.read_bytes())
+    except (FileNotFoundError, ValueError):
+        return {}
+    return row
+
+
+def _checksum(output: Path, row: dict[str, Any]) -> str:
+    """Hash a scene and its row."""
+    return hashlib.sha256(output.read_bytes() + json.dumps(row).encode()).hexdigest()
 
 
 def _fingerprint(job: FitJob) -> str:

@@ -7,6 +7,7 @@ import json
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +97,7 @@ class TestResume:
         Path("photos/b.png").write_bytes(Path("photos/c.png").read_bytes())
         code, out, err = fit_many(*arguments)
         assert (code, json.loads(out)["failed"]) == (1, 1) and err.startswith("kcgs: b.png: ")
-        assert "b.safetensors exists, made with other settings; --overwrite replaces it\n" in err
+        assert "b.safetensors exists, made with other settings or changed since; --overwrite replaces it\n" in err
         before = rows()
         assert fit_many("photos/b.png", *SETTINGS).code == 1 and rows() == before  # all is refused
         assert json.loads(fit_many(*arguments, "--overwrite").out)["fitted"] == 1
@@ -110,6 +111,24 @@ class TestResume:
         assert Path("out/a.safetensors").is_file() and fit_many("photos/a.png", *SETTINGS).code == 0
         Path("out/a.json").unlink()
         assert fit_many("photos/a.png", *SETTINGS).code == 1
+
+    @pytest.mark.parametrize(
+        ("name", "damage"),
+        [
+            ("a.safetensors", lambda data: b""),
+            ("a.safetensors", lambda data: data[:500]),
+            ("a.json", lambda data: data[:100]),
+            ("a.json", lambda data: data.replace(b'"psnr": ', b'"psnr": 9')),
+        ],
+    )
+    def test_damage(self, fit_many: Kcgs, name: str, damage: Callable[[bytes], bytes]) -> None:
+        assert fit_many("photos/a.png", *SETTINGS).code == 0
+        scene, file = Path("out/a.safetensors").read_bytes(), Path("out", name)
+        file.write_bytes(damage(file.read_bytes()))
+        code, _, err = fit_many("photos/a.png", *SETTINGS)
+        assert code == 1 and "a.safetensors exists, made with other settings or changed since; --overwrite" in err
+        assert json.loads(fit_many("photos/a.png", *SETTINGS, "--overwrite", "--json").out)["fitted"] == 1
+        assert Path("out/a.safetensors").read_bytes() == scene
 
     def test_killed_worker(self, fit_many: Kcgs) -> None:
         """A worker is killed over the second image: the next call keeps the first, which is that of this process."""
