@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import os
-import pickle
 import time
 from dataclasses import fields
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from kcgs._atomic import atomic_path, check_writable
+from kcgs._atomic import check_writable, write_file
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
@@ -26,6 +26,7 @@ from .state import FitState
 # a checkpoint is written when the fit has run this many times as long as the last one took to write
 _RUN_PER_WRITE = 100.0
 _VERSION = 6
+_DIGEST_SIZE = 32  # bytes of the SHA-256 of the content, which begins the file
 # all fields of the state that are numbers or flags
 _NUMBERS = [field.name for field in fields(FitState) if field.type in ("bool", "int", "float")]
 
@@ -45,19 +46,21 @@ class Checkpoint:
     def write(self, state: FitState, seconds: float) -> None:
         """Put the state, and the seconds of the fit so far, in the file's place."""
         start = time.perf_counter()
-        with atomic_path(self.path) as temporary, temporary.open("wb") as file:
-            torch.save({"problem": _fingerprint(self.problem), "seconds": seconds, **_to_plain(state)}, file)
+        buffer = io.BytesIO()
+        torch.save({"problem": _fingerprint(self.problem), "seconds": seconds, **_to_plain(state)}, buffer)
+        content = buffer.getvalue()
+        write_file(self.path, hashlib.sha256(content).digest() + content)
         end = time.perf_counter()
         self._next_write = end + _RUN_PER_WRITE * (end - start)
 
     def read(self) -> tuple[FitState, float]:
         """Return the state in the file, and the seconds of its fit; refuse what is damaged or another problem's."""
-        try:
-            plain = torch.load(self.path, weights_only=True)
-            fingerprint = plain["problem"]
-        except (RuntimeError, pickle.UnpicklingError, EOFError, KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"checkpoint {str(self.path)!r} is damaged, or no checkpoint of a fit") from error
-        if fingerprint != _fingerprint(self.problem):
+        data = self.path.read_bytes()
+        digest, content = data[:_DIGEST_SIZE], data[_DIGEST_SIZE:]
+        if hashlib.sha256(content).digest() != digest:
+            raise ValueError(f"checkpoint {str(self.path)!r} is damaged, or no checkpoint of a fit")
+        plain = torch.load(io.BytesIO(content), weights_only=True)
+        if plain["problem"] != _fingerprint(self.problem):
             raise ValueError(
                 f"checkpoint {str(self.path)!r} belongs to another fit: image, regions, settings, num_gaussians and "
                 "seed must be those it was written with"

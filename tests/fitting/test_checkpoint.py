@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from pathlib import Path
 
 import pytest
@@ -89,10 +90,18 @@ class TestCheckpoint:
 
     def test_damaged_is_refused(self, tmp_path: Path) -> None:
         image, labels = scene()
-        file = tmp_path / "state"
-        file.write_bytes(b"nothing of the kind")
-        with pytest.raises(ValueError, match="is damaged, or no checkpoint"):
-            fit(image, labels, 30, recipe=quick(), checkpoint=file, resume=True)
+        file, rng = tmp_path / "state", random.Random(0)
+        fit(image, labels, 30, recipe=quick(iterations=3), checkpoint=file)
+        content, cases = file.read_bytes(), [b"", b"nothing of the kind"]
+        for count in (0, 1, 2, 3) * 25:  # flipped bits; 0: a cut
+            damaged = bytearray(content if count else content[: rng.randrange(len(content))])
+            for bit in rng.sample(range(8 * len(content)), count):
+                damaged[bit // 8] ^= 1 << bit % 8
+            cases.append(bytes(damaged))
+        for case in cases:
+            file.write_bytes(case)
+            with pytest.raises(ValueError, match=r"^checkpoint '.*' is damaged, or no checkpoint of a fit$"):
+                fit(image, labels, 30, recipe=quick(iterations=3), checkpoint=file, resume=True)
 
     def test_needs_a_folder(self, tmp_path: Path) -> None:
         image, labels = scene()
