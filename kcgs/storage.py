@@ -52,9 +52,9 @@ def serialize(scene: Scene) -> bytes:
         labels = _narrow(regions.labels.cpu()).numpy()
         header["labels"] = {"dtype": labels.dtype.name, "shape": labels.shape}
         tensors["labels"] = torch.frombuffer(bytearray(_deflate(labels)), dtype=torch.uint8)
-    text = json.dumps(header, sort_keys=True)
-    _assemble(tensors, json.loads(text))  # raises where `deserialize` would
-    return safetensors.torch.save(tensors, {FORMAT: text})
+    _assemble(tensors, json.loads(json.dumps(header)))  # raises where `deserialize` would
+    header["checksum"] = _checksum(tensors, header)
+    return safetensors.torch.save(tensors, {FORMAT: json.dumps(header, sort_keys=True)})
 
 
 def deserialize(data: bytes) -> Scene:
@@ -82,6 +82,9 @@ def _assemble(tensors: dict[str, Tensor], header: Any) -> Scene:
         allowed = tuple(_INTEGERS.values()) if name in ("region_ids", "labels") else _FLOATS
         if tensor.dtype not in allowed:
             raise ValueError(f"{name} must have a dtype among {allowed}; got {tensor.dtype}")
+    # an editor may leave it out, and earlier files have none
+    if "checksum" in header and header.pop("checksum") != _checksum(tensors, header):
+        raise ValueError("its checksum is wrong: the file is damaged, or was edited and keeps the old checksum")
     height, width = header["size"]
     size = check_count("height", height, 1, MAX_SIDE), check_count("width", width, 1, MAX_SIDE)
     means, cholesky, colors = (tensors[name] for name in _REQUIRED)
@@ -94,6 +97,16 @@ def _assemble(tensors: dict[str, Tensor], header: Any) -> Scene:
             softness = {(low, high): value for low, high, value in softness}
         regions = RegionMap.from_labels(_inflate(tensors["labels"], **header["labels"]), softness)
     return Scene(field, regions, header["notes"])
+
+
+def _checksum(tensors: dict[str, Tensor], header: dict[str, Any]) -> int:
+    """Return the CRC-32 of the header and the tensors: of their names, types and shapes, then of their bytes."""
+    arrays = {name: tensor.numpy() for name, tensor in sorted(tensors.items())}
+    contents = [header, {name: [array.dtype.name, array.shape] for name, array in arrays.items()}]
+    checksum = zlib.crc32(json.dumps(contents, sort_keys=True).encode())
+    for array in arrays.values():
+        checksum = zlib.crc32(array.tobytes(), checksum)
+    return checksum
 
 
 def _narrow(integers: Tensor) -> Tensor:
