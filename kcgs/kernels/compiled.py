@@ -10,23 +10,30 @@ To add one, write in the module that calls it:
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import logging
+import pickle
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, cast
 
 import llvmlite
 import numba
-from llvmlite import binding
 from numba.core import caching, config
+from numba.core.compiler import CompileResult
+from numba.core.serialize import dumps
 from numba.misc.appdirs import AppDirs
+
+from kcgs._atomic import write_file
 
 log = logging.getLogger("kcgs")
 _config: Any = config
+
+_DIGEST_BYTES = hashlib.sha256().digest_size
 
 # without entry points for Python functions compile in less time
 inner = cast(Any, numba.njit)(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
@@ -42,38 +49,91 @@ class Program:
 
     def __init__(self, name: str, file: str, *others: str) -> None:
         self._name = name
-        self._folder = _find_folder(name, [Path(file), *(Path(file).parent / other for other in others)])
+        sources = Path(__file__), Path(file), *(Path(file).parent / other for other in others)
+        self.digests = [hashlib.sha256(source.read_bytes()).hexdigest() for source in sources]
         self._is_announced = False
 
     def entry(self, function: Callable[..., Any]) -> Callable[..., Any]:
         """Decorate a function that Python calls."""
         dispatcher: Any = cast(Any, numba.njit)(nogil=True, no_cfunc_wrapper=True, error_model="numpy")(function)
-        dispatcher._cache = _make_cache(function, self._folder, self._announce)
+        dispatcher._cache = _Cache(function, self)
         return cast(Callable[..., Any], dispatcher)
 
-    def _announce(self) -> None:
+    @functools.cached_property
+    def folder(self) -> Path | None:
+        """The folder of what its loops compile to; None: there is none."""
+        return _find_folder()
+
+    def announce(self) -> None:
         """Log, once, that a compilation begins, which takes seconds."""
         if not self._is_announced:
             self._is_announced = True
-            if self._folder is None:
+            if self.folder is None:
                 log.warning("kcgs: compiling the %s; to keep it, set NUMBA_CACHE_DIR to a folder", self._name)
             else:
                 log.info("kcgs: compiling the %s, once on this machine", self._name)
 
 
-def _find_folder(name: str, sources: Sequence[Path]) -> Path | None:
-    """Return the folder for what a program compiles to with this Python, numba and processor; None: there is none.
+class _Cache(caching.NullCache):
+    """What a function compiles to, on disk: for each signature a file of a pickle with its SHA-256 in front.
 
-    numba's own choice goes by the path of the sources, and looks at one file to tell whether they have changed.
+    numba's own cache sees a change of one source only, and hands damaged code to LLVM, which may abort the process.
     """
-    processor = binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()
-    versions = sys.implementation.cache_tag, numba.__version__, llvmlite.__version__
-    digest = hashlib.sha256(repr((name, *versions, *processor)).encode())
-    for source in (Path(__file__), *sources):
-        digest.update(source.read_bytes())
+
+    def __init__(self, function: Callable[..., Any], program: Program) -> None:
+        assert function.__closure__ is None, "the values of a closure are not part of the key"
+        self._program = program
+        self._name = function.__name__
+        versions = sys.implementation.cache_tag, numba.__version__, llvmlite.__version__
+        self._key = function.__module__, function.__qualname__, program.digests, *versions
+
+    def load_overload(self, signature: Any, context: Any) -> Any:
+        context.refresh()
+        path = self._path(signature, context.codegen())
+        content = None if path is None else _read_compiled(path)
+        if content is None:
+            self._program.announce()
+            return None
+        return CompileResult._rebuild(context, *pickle.loads(content))
+
+    def save_overload(self, signature: Any, result: Any) -> None:
+        path = self._path(signature, result.codegen)
+        if path is None:
+            return
+        assert not result.library.has_dynamic_globals, "an address, of a large global array, is for one process"
+        content: bytes = dumps(result._reduce())
+        try:
+            write_file(path, hashlib.sha256(content).digest() + content)
+        except OSError as error:
+            reason = error.strerror or error
+            _warn_once(f"kcgs: cannot write into {path.parent} ({reason}): what is compiled now is not kept")
+
+    def _path(self, signature: Any, codegen: Any) -> Path | None:
+        """Return the file for a signature and a processor."""
+        if self._program.folder is None:
+            return None
+        key = hashlib.sha256(repr((self._key, codegen.magic_tuple(), signature)).encode()).hexdigest()
+        return self._program.folder / f"kcgs-{self._name}-{key[:16]}.nbc"
+
+
+def _read_compiled(path: Path) -> bytes | None:
+    """Return the pickle in a file; None if there is none, or a damaged one."""
+    try:
+        data = path.read_bytes()
+    except OSError:  # what cannot be replaced either makes `save_overload` warn
+        return None
+    digest, content = data[:_DIGEST_BYTES], data[_DIGEST_BYTES:]
+    if hashlib.sha256(content).digest() == digest:
+        return content
+    _warn_once(f"kcgs: {path.parent} has damaged files: their loops are compiled anew, and the files replaced")
+    return None
+
+
+def _find_folder() -> Path | None:
+    """Return the first folder that can be written; None: there is none."""
     user = AppDirs(appname="kcgs", appauthor=False).user_cache_dir
-    for base in [_config.CACHE_DIR] if _config.CACHE_DIR else [user, Path(__file__).parent / "__pycache__"]:
-        folder = Path(base) / f"kcgs-{digest.hexdigest()[:16]}"
+    folders = [_config.CACHE_DIR] if _config.CACHE_DIR else [user, Path(__file__).parent / "__pycache__"]
+    for folder in map(Path, folders):
         with suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
             tempfile.TemporaryFile(dir=folder).close()
@@ -81,38 +141,6 @@ def _find_folder(name: str, sources: Sequence[Path]) -> Path | None:
     return None
 
 
-def _make_cache(function: Callable[..., Any], folder: Path | None, announce: Callable[[], None]) -> Any:
-    """Return numba's cache of a function; it calls `announce` where it does not hold what is asked for."""
-
-    class Locator(caching._CacheLocator):
-        _py_file = function.__code__.co_filename
-
-        @classmethod
-        def from_function(cls, *_: Any) -> Locator:
-            return cls()
-
-        def get_cache_path(self) -> str:
-            return str(folder)
-
-        def get_source_stamp(self) -> str:
-            return ""  # a folder is of one text of the sources
-
-        def get_disambiguator(self) -> str:
-            return "0"
-
-    class Implementation(caching.CompileResultCacheImpl):
-        _locator_classes: Any = (Locator,)
-
-    class Cache(caching.FunctionCache):
-        _impl_class = Implementation
-
-        def load_overload(self, signature: Any, context: Any) -> Any:
-            overload = super().load_overload(signature, context)  # type: ignore[no-untyped-call]
-            if overload is None:
-                announce()
-            return overload
-
-    cache: Any = cast(Any, Cache)(function)
-    if folder is None:
-        cache.disable()
-    return cache
+@functools.cache
+def _warn_once(message: str) -> None:
+    log.warning(message)

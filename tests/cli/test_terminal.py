@@ -90,6 +90,16 @@ def test_outputs_are_tried_before_the_work(
         assert sorted(Path().rglob("*")) == before
 
 
+def test_two_processes_write_one_file(kcgs: Kcgs) -> None:
+    kcgs("render", "scene.safetensors", "-o", "alone.png")
+    command = [sys.executable, "-m", "kcgs", "render", "scene.safetensors", "-o", "same.png"]
+    before = set(Path().iterdir())
+    processes = [subprocess.Popen(command) for _ in range(2)]
+    assert [process.wait() for process in processes] == [0, 0]
+    assert Path("same.png").read_bytes() == Path("alone.png").read_bytes()
+    assert set(Path().iterdir()) - before == {Path("same.png")}
+
+
 @pytest.mark.parametrize("option", ["--scale=400", "--size=19200x12800", "--scale=1e6"])
 def test_renders_that_do_not_fit_into_memory(kcgs: Kcgs, monkeypatch: pytest.MonkeyPatch, option: str) -> None:
     monkeypatch.setattr("kcgs._memory.free_memory", lambda: 1e9)

@@ -1,16 +1,31 @@
-"""Compiled loops: where they are kept, and what the log says."""
+"""Compiled loops: where they are kept, damaged files, and what the log says."""
 
 from __future__ import annotations
 
-import shutil
+import errno
+import os
+import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import pytest
 
 from kcgs.kernels import compiled
 from kcgs.kernels.compiled import Program, inner
+
+LOOPS = """
+from kcgs.kernels.compiled import Program
+
+from .constants import FACTOR
+
+
+@Program("scaling", __file__).entry
+def scale(values):
+    return FACTOR * values[0]
+"""
 
 
 @inner
@@ -29,11 +44,23 @@ def double_in(cache: Path, monkeypatch: pytest.MonkeyPatch) -> float:
     return float(double(np.array([1.5])))
 
 
+def make_scaling(folder: Path, factor: float) -> Path:
+    """Write a package whose loop takes a constant from another module."""
+    package = folder / "scaling"
+    package.mkdir(parents=True)
+    (package / "__init__.py").touch()
+    (package / "constants.py").write_text(f"FACTOR = {factor}\n")
+    (package / "loops.py").write_text(LOOPS)
+    return folder
+
+
 def test_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level("INFO", "kcgs"):
         assert [double_in(tmp_path, monkeypatch) for _ in range(2)] == [3.0, 3.0]
     assert caplog.messages == ["kcgs: compiling the doubling, once on this machine"]
-    assert len(list(tmp_path.glob("kcgs-*/*.nbc"))) == 1
+    assert len(list(tmp_path.rglob("*.nbc"))) == 1
+    monkeypatch.setattr(compiled._config, "CPU_NAME", "other")
+    assert double_in(tmp_path, monkeypatch) == 3.0 and len(list(tmp_path.rglob("*.nbc"))) == 2
 
 
 def test_without_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
@@ -42,17 +69,77 @@ def test_without_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplo
     assert caplog.messages == ["kcgs: compiling the doubling; to keep it, set NUMBA_CACHE_DIR to a folder"]
 
 
-def test_folder_follows_the_text_of_sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two checkouts share what they compile; another source, or processor, has another folder."""
-    monkeypatch.setattr(compiled._config, "CACHE_DIR", str(tmp_path / "cache"))
-    copy = Path(shutil.copy(__file__, tmp_path / "copy.py"))
-    folder = compiled._find_folder("name", [Path(__file__)])
-    assert folder is not None and folder.parent == tmp_path / "cache"
-    assert folder == compiled._find_folder("name", [copy]) != compiled._find_folder("other", [copy])
-    copy.write_text(copy.read_text() + "\n")
-    assert folder != compiled._find_folder("name", [copy])
-    monkeypatch.setattr(compiled.binding, "get_host_cpu_name", lambda: "other")
-    assert folder != compiled._find_folder("name", [Path(__file__)])
+def flip_a_bit(file: Path) -> None:
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 1
+    file.write_bytes(data)
+
+
+def replace_by_a_folder(file: Path) -> None:
+    file.unlink()
+    file.mkdir()
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        pytest.param(lambda file: file.write_bytes(b""), id="empty"),
+        pytest.param(lambda file: file.write_bytes(file.read_bytes()[:1000]), id="truncated"),
+        pytest.param(lambda file: file.write_bytes(b"\n" * 1000), id="overwritten"),
+        flip_a_bit,
+        replace_by_a_folder,
+    ],
+)
+def test_damaged_files(
+    damage: Callable[[Path], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Damaged code must not reach LLVM, which ends the process."""
+    double_in(tmp_path, monkeypatch)
+    caplog.clear()
+    for file in list(tmp_path.rglob("*.nb?")):
+        damage(file)
+    with caplog.at_level("WARNING", "kcgs"):
+        assert [double_in(tmp_path, monkeypatch) for _ in range(2)] == [3.0, 3.0]
+    assert len(caplog.messages) == 1 and str(tmp_path) in caplog.text
+
+
+def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    def fail(*_: object) -> NoReturn:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", fail)
+    with caplog.at_level("WARNING", "kcgs"):
+        assert [double_in(tmp_path, monkeypatch) for _ in range(2)] == [3.0, 3.0]
+    reason = "(No space left on device): what is compiled now is not kept"
+    assert caplog.messages == [f"kcgs: cannot write into {tmp_path} {reason}"]
+    assert not list(tmp_path.rglob("*.nb*"))
+
+
+def test_two_processes_compile_at_once(tmp_path: Path) -> None:
+    code = (
+        "import numpy as np\n"
+        "from scaling.loops import scale\n"
+        "print('ready', flush=True)\n"
+        "input()\n"
+        "print(scale(np.ones(1)))\n"
+    )
+    folder, cache = make_scaling(tmp_path / "folder", 2.0), tmp_path / "cache"
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", code], cwd=folder, env=environment, text=True,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        )
+        for _ in range(2)
+    ]  # fmt: skip
+    for process in processes:
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
+    for process in processes:
+        assert process.stdin is not None
+        process.stdin.write("\n")
+        process.stdin.flush()
+    assert [process.communicate()[0] for process in processes] == ["2.0\n", "2.0\n"]
+    assert len([path for path in cache.rglob("*") if path.is_file()]) == 1
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have other places")
@@ -64,5 +151,5 @@ def test_folder_of_the_user(user: dict[str, str], tmp_path: Path, monkeypatch: p
             monkeypatch.setenv(name, str(tmp_path / place))
         else:
             monkeypatch.delenv(name, raising=False)
-    folder = compiled._find_folder("name", [])
+    folder = compiled._find_folder()
     assert folder is not None and folder.is_relative_to(tmp_path)
