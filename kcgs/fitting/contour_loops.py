@@ -9,7 +9,7 @@ import numpy as np
 
 from kcgs.kernels.compiled import Program, inner
 
-program = Program("contour refinement", __file__)
+program = Program("contour refinement")
 
 # states of a pixel in the search for small pieces
 _UNKNOWN = 0

@@ -4,7 +4,7 @@ import numpy as np
 
 from kcgs.kernels.compiled import Program, inner
 
-program = Program("measurement of a fit", __file__)
+program = Program("measurement of a fit")
 
 
 @inner

@@ -13,7 +13,7 @@ from kcgs.kernels.tasks import first_task, next_task
 # candidates of which the largest gain is kept
 _BLOCK = 128
 
-program = Program("matching pursuit", __file__, "../kernels/tasks.py")
+program = Program("matching pursuit")
 
 
 @intrinsic

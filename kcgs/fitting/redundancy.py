@@ -35,7 +35,7 @@ _ROOT = 5
 # Gaussians of a task
 _TASK_ROWS = 64
 
-program = Program("choice of Gaussians to remove", __file__, "../kernels/tasks.py")
+program = Program("choice of Gaussians to remove")
 
 
 @inner

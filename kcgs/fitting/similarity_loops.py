@@ -31,7 +31,7 @@ HALVE = 0  # average blocks of the difference for the rows of all scales
 SCORE = 1  # the score of a scale, and the gradient by its pixels without the factor of the mean score
 SUM = 2  # the gradient by the pixels of the image
 
-program = Program("objective of MS-SSIM", __file__, "../kernels/tasks.py")
+program = Program("objective of MS-SSIM")
 
 
 class Scales(NamedTuple):

@@ -2,10 +2,12 @@
 
 To add one, write in the module that calls it:
 
-1. `program = Program("what the log calls it", __file__)`, with the names of the other files that its loops come from;
+1. `program = Program("what the log calls it")`;
 2. `@program.entry` above a function that Python calls, with arrays in C order, numbers and named tuples of both;
 3. `@inner` above a function that only compiled functions call, `@inline` where it is small and called often,
    `@part` where it is large and called once.
+
+Where the module's text changes, or that of a module of kcgs that it imports at its top, its functions compile anew.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import functools
 import hashlib
 import logging
 import pickle
+import re
 import sys
 import tempfile
 from collections.abc import Callable
@@ -33,6 +36,10 @@ from kcgs._atomic import write_file
 log = logging.getLogger("kcgs")
 _config: Any = config
 
+_PACKAGE = Path(__file__).parents[1]
+# imports at the top of a source: dots or the package, the rest of a module's name, the names from it; `ast` takes 10
+# times as long
+_IMPORT = re.compile(r"^from (\.+|kcgs\b)\.?([\w.]*) import (\([^)]*\)|.*)", re.MULTILINE)
 _DIGEST_BYTES = hashlib.sha256().digest_size
 
 # without entry points for Python functions compile in less time
@@ -45,12 +52,10 @@ part = cast(Any, numba.njit)(no_cpython_wrapper=True, no_cfunc_wrapper=True, err
 
 
 class Program:
-    """The compiled loops of some source files: `file`, and `others` beside it."""
+    """The compiled loops of one purpose."""
 
-    def __init__(self, name: str, file: str, *others: str) -> None:
+    def __init__(self, name: str) -> None:
         self._name = name
-        sources = Path(__file__), Path(file), *(Path(file).parent / other for other in others)
-        self.digests = [hashlib.sha256(source.read_bytes()).hexdigest() for source in sources]
         self._is_announced = False
 
     def entry(self, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -85,7 +90,8 @@ class _Cache(caching.NullCache):
         self._program = program
         self._name = function.__name__
         versions = sys.implementation.cache_tag, numba.__version__, llvmlite.__version__
-        self._key = function.__module__, function.__qualname__, program.digests, *versions
+        sources = _hash_sources(Path(function.__code__.co_filename))
+        self._key = function.__module__, function.__qualname__, sources, *versions
 
     def load_overload(self, signature: Any, context: Any) -> Any:
         context.refresh()
@@ -139,6 +145,36 @@ def _find_folder() -> Path | None:
             tempfile.TemporaryFile(dir=folder).close()
             return folder
     return None
+
+
+@functools.cache
+def _hash_sources(file: Path) -> list[str]:
+    """Return digests of the sources of a file's loops, in an order that does not depend on paths."""
+    return sorted(hashlib.sha256(source.read_bytes()).hexdigest() for source in _find_sources(file))
+
+
+def _find_sources(file: Path) -> set[Path]:
+    """Return a file, the files of kcgs that it imports at its top, those that these import, and tables beside them."""
+    sources: set[Path] = set()
+    pending = [file]
+    while pending:
+        source = pending.pop()
+        if source not in sources:
+            sources.add(source)
+            pending += _find_imports(source)
+    return sources | {table for folder in {source.parent for source in sources} for table in folder.glob("*.bin")}
+
+
+@functools.cache
+def _find_imports(file: Path) -> list[Path]:
+    """Return the files of the modules of kcgs that a file imports from."""
+    modules = []
+    for start, name, members in _IMPORT.findall(file.read_text(encoding="utf-8")):
+        folder = file.parents[len(start) - 1] if start.startswith(".") else _PACKAGE
+        module = folder.joinpath(*name.split("."))
+        modules += [module, *(module / member for member in re.findall(r"\w+", members) if module.is_dir())]
+    sources = (source for module in modules for source in (Path(f"{module}.py"), module / "__init__.py"))
+    return [source for source in sources if source.is_file()]
 
 
 @functools.cache

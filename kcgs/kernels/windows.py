@@ -7,7 +7,7 @@ import numpy as np
 from .compiled import Program, inner
 from .tasks import first_task, next_task
 
-program = Program("tables of label maps", __file__, "tasks.py")
+program = Program("tables of label maps")
 
 
 @program.entry

@@ -9,7 +9,7 @@ import numpy as np
 
 from kcgs.kernels.compiled import Program, inner
 
-program = Program("optimizer", __file__)
+program = Program("optimizer")
 
 
 class Adam(NamedTuple):

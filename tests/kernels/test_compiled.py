@@ -1,28 +1,35 @@
-"""Compiled loops: where they are kept, damaged files, and what the log says."""
+"""Compiled loops: what their files on disk follow from, damaged files, and what the log says."""
 
 from __future__ import annotations
 
+import ast
 import errno
+import inspect
 import os
 import subprocess
 import sys
 from collections.abc import Callable
+from importlib import import_module
+from importlib.util import resolve_name
 from pathlib import Path
-from typing import NoReturn
+from types import CodeType, FunctionType
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
 
+import kcgs
 from kcgs.kernels import compiled
 from kcgs.kernels.compiled import Program, inner
 
+ROOT = Path(kcgs.__file__).parent
 LOOPS = """
 from kcgs.kernels.compiled import Program
 
 from .constants import FACTOR
 
 
-@Program("scaling", __file__).entry
+@Program("scaling").entry
 def scale(values):
     return FACTOR * values[0]
 """
@@ -37,7 +44,7 @@ def double_in(cache: Path, monkeypatch: pytest.MonkeyPatch) -> float:
     """Run a loop of a new program, as a new process would."""
     monkeypatch.setattr(compiled._config, "CACHE_DIR", str(cache))
 
-    @Program("doubling", __file__).entry
+    @Program("doubling").entry
     def double(values):  # type: ignore[no-untyped-def]
         return twice(values[0])
 
@@ -140,6 +147,81 @@ def test_two_processes_compile_at_once(tmp_path: Path) -> None:
         process.stdin.flush()
     assert [process.communicate()[0] for process in processes] == ["2.0\n", "2.0\n"]
     assert len([path for path in cache.rglob("*") if path.is_file()]) == 1
+
+
+def test_constant_of_another_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two checkouts share what they compile, unless a module differs that the loop takes a constant from."""
+    monkeypatch.setattr(compiled._config, "CACHE_DIR", str(tmp_path / "cache"))
+    for name, factor, num_files in (("first", 2.0, 1), ("second", 2.0, 1), ("third", 3.0, 2)):
+        with monkeypatch.context() as patch:
+            patch.syspath_prepend(make_scaling(tmp_path / name, factor))
+            assert import_module("scaling.loops").scale(np.ones(1)) == factor
+        for module in ("scaling", "scaling.constants", "scaling.loops"):
+            del sys.modules[module]
+        assert len(list((tmp_path / "cache").rglob("*.nbc"))) == num_files
+
+
+def global_names(code: CodeType) -> set[str]:
+    """Return the names of globals, and of attributes, in the code of a function and of the functions within it."""
+    return set(code.co_names).union(*(global_names(part) for part in code.co_consts if isinstance(part, CodeType)))
+
+
+def find_origins(module: str) -> dict[str, str]:
+    """Return the modules that a module imports names from."""
+    origins: dict[str, str] = {}
+    for node in ast.walk(ast.parse(inspect.getsource(sys.modules[module]))):
+        if isinstance(node, ast.ImportFrom):
+            source = resolve_name("." * node.level + (node.module or ""), sys.modules[module].__package__)
+            origins |= {alias.asname or alias.name: source for alias in node.names}
+    return origins
+
+
+def find_modules(loop: Any) -> set[str]:
+    """Return the modules of kcgs that a loop, and the functions and classes that it uses, take names from."""
+    modules: set[str] = set()
+    pending, visited = [loop], set()
+    while pending:
+        value = pending.pop()
+        value = getattr(value, "py_func", getattr(value, "_defn", value))  # of compiled functions, and of intrinsics
+        if id(value) in visited or not str(getattr(value, "__module__", "")).startswith("kcgs."):
+            continue
+        visited.add(id(value))
+        if isinstance(value, type):
+            pending += vars(value).values()
+        if isinstance(value, FunctionType):
+            origins = find_origins(value.__module__)
+            names = global_names(value.__code__) & value.__globals__.keys()
+            pending += [value.__globals__[name] for name in names]
+            pending += [cell.cell_contents for cell in value.__closure__ or ()]
+            modules |= {value.__module__, *(origins.get(name, value.__module__) for name in names)}
+    return {module for module in modules if module.startswith("kcgs.")}
+
+
+@pytest.mark.parametrize(
+    "file",
+    sorted(file.relative_to(ROOT) for file in ROOT.rglob("*.py") if "\n@program.entry\n" in file.read_text("utf-8")),
+    ids=str,
+)
+def test_sources_hold_all_that_loops_name(file: Path) -> None:
+    module = import_module(".".join(("kcgs", *file.with_suffix("").parts)))
+    loops = [value for value in vars(module).values() if isinstance(getattr(value, "_cache", None), compiled._Cache)]
+    modules = set().union(*map(find_modules, loops))
+    assert module.__name__ in modules
+    assert {Path(str(sys.modules[name].__file__)) for name in modules} <= compiled._find_sources(ROOT / file)
+
+
+@pytest.mark.parametrize(
+    ("file", "source"),
+    [
+        ("fitting/similarity_loops.py", "functional/metrics.py"),
+        ("codec/labels/wavefront.py", "codec/labels/scene_prior.bin"),
+        ("kernels/cpu/loops.py", "kernels/cpu/channels.py"),
+    ],
+)
+def test_sources_that_no_loop_is_in(file: str, source: str) -> None:
+    sources = compiled._find_sources(ROOT / file)
+    assert ROOT / source in sources
+    assert all(path.is_relative_to(ROOT) for path in sources) and len(sources) < 20  # not all of kcgs, nor of others
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have other places")

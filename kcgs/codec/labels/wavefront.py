@@ -88,7 +88,7 @@ def new_scan(seeds: Any, num_regions: int, *, is_file: bool) -> Scan:
     )
 
 
-program = Program("label coder", __file__, "contexts.py", "scene_prior.bin", "map_file_prior.bin")
+program = Program("label coder")
 
 
 @program.entry

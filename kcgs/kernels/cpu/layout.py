@@ -7,12 +7,7 @@ from typing import Any, NamedTuple
 
 from ..compiled import Program
 
-program = Program(
-    "CPU kernel",
-    __file__,
-    "../tasks.py", "../whitened.py", "channels.py", "ellipse.py", "gradients.py", "lists.py", "loops.py", "rows.py",
-    "schedule.py", "simd.py", "spline.py",
-)  # fmt: skip
+program = Program("CPU kernel")
 
 # whitened coordinates times this, squared, are an exponent of 2
 SCALE = math.sqrt(0.5 / math.log(2.0))
