@@ -77,7 +77,7 @@ class TestThreads:
         assert set(threads) == {(1, 3)} and torch.get_num_threads() == 3
 
 
-_program = Program("tasks of a test", __file__)
+_program = Program("tasks of a test")
 
 
 @_program.entry
