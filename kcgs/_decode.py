@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
+from kcgs._rows import row_slices
+
 Array = NDArray[Any]
 
 # tifffile logs the defects of a file, too, which the error names already
@@ -57,16 +59,18 @@ def decode(path: str | os.PathLike[str], *, indices: bool = False) -> Samples:
 
 
 def _pillow(data: bytes, image: Image.Image, indices: bool) -> Samples:
+    # Pillow turns TIFF itself
+    orientation = 1 if image.format == "TIFF" else image.getexif().get(_ORIENTATION, 1)
     # in a PNG, byte 24 is the number of bits, and byte 25 the kind of colours: 2 is RGB, 6 RGBA
     if data.startswith(_PNG) and data[24] == 16 and data[25] in (2, 6):
         from kornia_rs.io import decode_image_png_u16
 
         mode = "rgb" if data[25] == 2 else "rgba"
+        image.close()  # frees its pixels of 8 bits
         values = np.asarray(decode_image_png_u16(data, (image.height, image.width), mode))
     else:
         values = pil_indices(image) if indices else pil_samples(image)
-    if image.format != "TIFF":  # which Pillow turns itself
-        values = _upright(values, image.getexif().get(_ORIENTATION, 1))
+    values = _upright(values, orientation)
     white = 1.0 if values.dtype.kind == "f" else float(np.iinfo(values.dtype).max)
     # the second image in a photo of a telephone is no frame: it belongs to the first
     frames = 1 if image.format == "MPO" else getattr(image, "n_frames", 1)
@@ -81,15 +85,17 @@ def is_lossless(image: Image.Image) -> bool:
 def pil_samples(image: Any) -> NDArray[Any]:
     """Return the pixels of a PIL image, (H, W, C): grey, grey and alpha, RGB or RGBA, of uint8, uint16 or float32."""
     if image.mode == "F":
-        values = np.asarray(image)
-    elif image.mode.startswith("I"):  # 16-bit grey, which Pillow has in 32 bits for some formats
-        values = np.asarray(image).astype(np.uint16)
-    else:
-        mode = "L" if image.mode in ("1", "L") else "RGB"
-        if image.has_transparency_data:
-            mode = "LA" if image.mode in ("LA", "La") else "RGBA"
-        values = np.asarray(image.convert(mode))
-    return values if values.ndim == 3 else values[..., None]
+        return np.asarray(image)[..., None]
+    if image.mode.startswith("I"):  # 16-bit grey, which Pillow has in 32 bits for some formats
+        return np.asarray(image).astype(np.uint16)[..., None]
+    mode = "L" if image.mode in ("1", "L") else "RGB"
+    if image.has_transparency_data:
+        mode = "LA" if image.mode in ("LA", "La") else "RGBA"
+    values = np.empty((image.height, image.width, len(mode)), np.uint8)
+    for rows in row_slices(image.height, image.width):  # at once, Pillow would copy the pixels three times
+        part = image.crop((0, rows.start, image.width, rows.stop)).convert(mode)
+        values[rows] = np.asarray(part).reshape(values[rows].shape)
+    return values
 
 
 def pil_indices(image: Any) -> Array:
@@ -105,7 +111,8 @@ def _tiff(data: bytes) -> Samples | None:
     import tifffile
     from tifffile import EXTRASAMPLE, PHOTOMETRIC
 
-    with tifffile.TiffFile(BytesIO(data)) as file:
+    # closing the stream frees the data, which tifffile's reference cycle would keep
+    with BytesIO(data) as stream, tifffile.TiffFile(stream) as file:
         page: Any = file.pages[0]
         is_grey = page.photometric in (PHOTOMETRIC.MINISBLACK, PHOTOMETRIC.MINISWHITE)
         is_unsigned = page.sampleformat == tifffile.SAMPLEFORMAT.UINT

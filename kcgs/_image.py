@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from typing import Any
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs._check import check_floating, check_image, is_pil
+from kcgs._rows import row_slices
 from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument, InvalidArgumentType
 
@@ -38,7 +40,7 @@ def as_image(name: str, value: object, tolerance: float = 0.0, keep_alpha: bool 
     elif isinstance(value, Tensor):
         if value.dtype == torch.uint8:
             raise InvalidArgumentType(name, "floating, in [0, 1]", f"{value.dtype}: pass {name} / 255")
-        image = check_floating(name, value, dims=(3, 4), finite=False)  # check_image does that below
+        image = check_floating(name, value, dims=(3, 4), finite=False)  # which is checked below
     elif isinstance(value, str | os.PathLike):
         return read_image(value)
     else:
@@ -48,15 +50,20 @@ def as_image(name: str, value: object, tolerance: float = 0.0, keep_alpha: bool 
         if image.shape[0] != 1:
             raise InvalidArgument(name, "one image, (C, H, W) or (1, C, H, W)", tuple(image.shape))
         image = image[0]
-    check_image(name, image)
+    low, high = (float(end) for end in image.detach().aminmax()) if image.numel() else (math.nan, math.nan)
+    if not (math.isfinite(low) and math.isfinite(high)):
+        check_image(name, image.detach().cpu())  # raises: not finite, or empty
     if image.shape[-1] in (1, 3, 4) and min(image.shape[:2]) > 4:
         advice = f"pass {name}.permute(2, 0, 1), or a numpy array (H, W, C)"
         raise InvalidArgument(name, "(C, H, W)", f"{tuple(image.shape)}, which looks like (H, W, C): {advice}")
-    low, high = float(image.detach().min()), float(image.detach().max())
     if low < -tolerance or high > 1 + tolerance:
         hint = ": divide it by 255" if 1 < high <= 255 and low >= 0 else ""
         raise InvalidArgument(name, "in [0, 1]", f"[{low:g}, {high:g}]{hint}")
-    return _on_white(name, image) if has_alpha and not keep_alpha else image
+    if not has_alpha or keep_alpha:
+        return image
+    if image[-1].min() < 1:
+        _warn_of_alpha(name)
+    return torch.from_numpy(_on_white(image.numpy()))
 
 
 def _from_array(name: str, array: NDArray[Any]) -> Tensor:
@@ -65,8 +72,8 @@ def _from_array(name: str, array: NDArray[Any]) -> Tensor:
     if array.ndim != 3 or array.shape[-1] > 4:
         raise InvalidArgument(name, "an array (H, W) or (H, W, C) with 1 to 4 channels", f"shape {array.shape}")
     if array.dtype in (np.uint8, np.uint16):
-        array = array.astype(np.float32) / np.float32(np.iinfo(array.dtype).max)
-    elif array.dtype not in (np.float32, np.float64):
+        return torch.from_numpy(_planes(array, np.iinfo(array.dtype).max))
+    if array.dtype not in (np.float32, np.float64):
         raise InvalidArgumentType(name, "uint8, uint16, float32 or float64", array.dtype, verb="hold")
     return torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1)))
 
@@ -80,22 +87,47 @@ def read_image(path: str | os.PathLike[str], channels: str = "RGB") -> Tensor:
         raise ValueError(f"cannot read {path}: {samples.values.dtype} samples have no stated white")
     if samples.frames > 1:
         warn_user(f"{path} holds {samples.frames} images: the first is read")
-    pixels = samples.values.astype(np.float32) / np.float32(samples.white)
-    image = as_image(str(path), torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1))))
+    values, white = samples.values, samples.white
+    if values.dtype.kind == "f":
+        values = np.ascontiguousarray(values, np.float32)
+        as_image(str(path), torch.from_numpy(values.transpose(2, 0, 1)))
+    if channels != "RGBA" and values.shape[-1] in (2, 4) and values[..., -1].min() < white:
+        _warn_of_alpha(str(path))
+    image = np.empty((len(channels), *values.shape[:2]), np.float32)
+    for rows in row_slices(*values.shape[:2]):
+        image[:, rows] = _with_channels(_planes(values[rows], white), channels)
+    return torch.from_numpy(image)
+
+
+def _planes(values: NDArray[Any], white: float) -> NDArray[Any]:
+    """Return samples (H, W, C) as (C, H, W) float32, divided by the value of full intensity."""
+    height, width, channels = values.shape
+    planes = np.empty((channels, height, width), np.float32)
+    np.divide(values.transpose(2, 0, 1), white, out=planes, dtype=np.float32)
+    return planes
+
+
+def _with_channels(image: NDArray[Any], channels: str) -> NDArray[Any]:
+    """Return an image of 1 to 4 channels as "RGB", "L" or "RGBA"; grey has one channel as "RGB", too."""
     if channels == "RGBA":
-        color, alpha = (image[:-1], image[-1:]) if len(image) in (2, 4) else (image, torch.ones_like(image[:1]))
-        return torch.cat([color.expand(3, -1, -1), alpha])
-    image = _on_white(str(path), image)
-    if channels == "RGB":
-        return image.expand(3, -1, -1).contiguous()
-    return image if len(image) == 1 else torch.einsum("chw,c->hw", image, torch.tensor(LUMA))[None].clamp(0, 1)
+        color, alpha = (image[:-1], image[-1:]) if len(image) in (2, 4) else (image, np.ones_like(image[:1]))
+        return np.concatenate([np.broadcast_to(color, (3, *color.shape[1:])), alpha])
+    image = _on_white(image)
+    if channels == "RGB" or len(image) == 1:
+        return image
+    red, green, blue = image * np.array(LUMA, np.float32)[:, None, None]
+    luma: NDArray[Any] = (red + green + blue)[None].clip(0, 1)
+    return luma
 
 
-def _on_white(name: str, image: Tensor) -> Tensor:
-    """Compose an image with alpha, (2, H, W) or (4, H, W), on white, and say so; return others as they are."""
+def _warn_of_alpha(name: str) -> None:
+    warn_user(f"{name} has transparent pixels: they are composed on white")
+
+
+def _on_white(image: NDArray[Any]) -> NDArray[Any]:
+    """Compose an image with alpha, (2, H, W) or (4, H, W), on white; return others as they are."""
     if len(image) not in (2, 4):
         return image
     color, alpha = image[:-1], image[-1:]
-    if alpha.min() < 1:
-        warn_user(f"{name} has transparent pixels: they are composed on white")
-    return (color * alpha + (1 - alpha)).clamp(0, 1)
+    opaque: NDArray[Any] = (color * alpha + (1 - alpha)).clip(0, 1)
+    return opaque

@@ -32,7 +32,7 @@ LAYERS = [
     {"kernels", "engine", "plots"},
     {"_image", "_labels"},
     {"_check", "_decode", "_memory", "_atomic", "_progress", "_repr", "_suffixes", "_warn"},
-    {"errors"},
+    {"errors", "_rows"},
 ]
 # what to say: what not to
 REPLACED = {
