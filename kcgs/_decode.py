@@ -25,6 +25,7 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 _TIFF = (b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")
 # tag of the orientation in EXIF and TIFF
 _ORIENTATION = 274
+_CHANNELS = 4  # of an image at most; a TIFF may have more samples per pixel, which are decoded and left out
 _LOSSLESS_FORMATS = ("PNG", "GIF", "BMP", "TIFF")
 
 
@@ -118,15 +119,15 @@ def _tiff(data: bytes) -> Samples | None:
         is_unsigned = page.sampleformat == tifffile.SAMPLEFORMAT.UINT
         if not (is_grey or page.photometric == PHOTOMETRIC.RGB) or (is_unsigned and page.bitspersample in (1, 8)):
             return None
+        alpha = page.extrasamples[0] if page.extrasamples else None
+        if page.axes not in ("YX", "YXS") or alpha == EXTRASAMPLE.ASSOCALPHA:
+            raise ValueError(f"its first page has axes {page.axes}; expected one image, alpha not multiplied in")
         # a damaged or hostile header can claim any size: the limit is that of Pillow for its own formats
-        count, limit = page.imagewidth * page.imagelength, Image.MAX_IMAGE_PIXELS
+        count, limit = max(page.imagewidth * page.imagelength, page.size // _CHANNELS), Image.MAX_IMAGE_PIXELS
         if limit is not None and count > 2 * limit:
             raise ValueError(f"its header claims {count} pixels, more than twice the limit of {limit}")
         values = page.asarray()
         orientation = page.tags[_ORIENTATION].value if _ORIENTATION in page.tags else 1
-    alpha = page.extrasamples[0] if page.extrasamples else None
-    if page.axes not in ("YX", "YXS") or alpha == EXTRASAMPLE.ASSOCALPHA:
-        raise ValueError(f"its first page has axes {page.axes}; expected one image, alpha not multiplied in")
     channels = (1 if is_grey else 3) + (alpha == EXTRASAMPLE.UNASSALPHA)
     values = values[..., None] if page.axes == "YX" else values[..., :channels]
     white = None

@@ -43,8 +43,8 @@ def load_image(
 
     Raises:
         OSError: ``path`` does not exist, or is a folder.
-        ValueError: the file is truncated or no image, its samples have no defined white (32-bit integers, floats
-            outside [0, 1]), or ``channels`` is another word.
+        ValueError: the file is truncated or no image, has more than twice ``PIL.Image.MAX_IMAGE_PIXELS``, its samples
+            have no defined white (32-bit integers, floats outside [0, 1]), or ``channels`` is another word.
 
     Warns:
         UserWarning: the file holds several images; it has transparent pixels, which are composed on white.

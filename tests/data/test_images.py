@@ -13,7 +13,7 @@ import tifffile
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import Image, ImageOps
+from PIL import Image, ImageFile, ImageOps
 from torch import Tensor
 
 from kcgs.data import load_image, save_image
@@ -196,6 +196,22 @@ class TestLoadImage:
     def test_bad_files(self, tmp_path: Path, data: bytes, message: str) -> None:
         with pytest.raises(ValueError, match=message):
             load_image(write(tmp_path / "a.png", data))
+
+    @pytest.mark.parametrize(
+        ("data", "message"),
+        [
+            (pillow_bytes(GREY), "Image size .* exceeds limit of 40 pixels"),
+            (tiff_bytes(DEEP[1]), "its header claims 54 pixels, more than twice the limit of 20"),
+            (tiff_bytes(np.zeros((1, 1, 200), np.uint16), planarconfig="contig"), "its header claims 50 pixels"),
+        ],
+    )
+    def test_limit_of_pillow(self, tmp_path: Path, data: bytes, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+        """The header is checked, before pixels are decoded."""
+        monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 20)
+        monkeypatch.setattr(ImageFile.ImageFile, "load", None)
+        monkeypatch.setattr(tifffile.TiffPage, "asarray", None)
+        with pytest.raises(ValueError, match=message):
+            load_image(write(tmp_path / "a", data))
 
     @pytest.mark.parametrize("share", [0.3, 0.8])
     @pytest.mark.parametrize("kind", WHOLE)
