@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs._check import check_integer, is_pil, verify
+from kcgs._rows import row_slices
 from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument, InvalidArgumentType
 
@@ -98,37 +99,62 @@ def _from_samples(name: str, values: NDArray[Any], expression: str) -> Tensor:
 
 def _from_grey(name: str, values: NDArray[Any], expression: str) -> Tensor:
     _warn_of_antialiasing(values, expression)
-    return check_labels(name, _from_array(name, values, True), dims=(2,))
+    return check_labels(name, _from_array(name, values, True, copy=False), dims=(2,))
 
 
-def _from_array(name: str, array: NDArray[Any], values: bool) -> Tensor:
+def _from_array(name: str, array: NDArray[Any], values: bool, copy: bool = True) -> Tensor:
     if array.dtype.kind not in "biu":
         raise InvalidArgumentType(name, "an integer dtype", array.dtype, verb="have")
     if values and array.dtype == np.uint64 and array.size and array.max() >= 1 << 63:
         raise InvalidArgument(name, "ids below 2**63", array.max(), verb="hold")
-    return torch.from_numpy(np.array(array, np.int64, order="C"))
+    return torch.from_numpy((np.array if copy else np.asarray)(array, np.int64, order="C"))
 
 
 def _from_ids(values: NDArray[Any], path: str | os.PathLike[str]) -> Tensor:
     if values.dtype != np.uint8 or values.shape[-1] != 3:
         samples = f"{values.shape[-1]} channels of {values.dtype}"
         raise ValueError(f"colours that are ids must be RGB of 8 bits; got {samples} in {path}")
-    return torch.from_numpy(values @ np.array([1, 1 << 8, 1 << 16]))
+    ids = values[..., 2].astype(np.int64, order="C")
+    for channel in (1, 0):
+        ids <<= 8
+        ids |= values[..., channel]
+    return torch.from_numpy(ids)
 
 
 def _from_colors(values: NDArray[Any], path: str | os.PathLike[str]) -> Tensor:
-    packed = np.zeros(values.shape[:2], dtype=np.uint64)
-    for channel in range(values.shape[-1]):
-        packed = (packed << np.uint64(16)) | values[..., channel].astype(np.uint64)
-    if values.shape[-1] == 4:
-        packed[values[..., 3] == 0] = 0
-    colors, ids = np.unique(packed, return_inverse=True)
+    height, width = values.shape[:2]
+    packed = np.empty((height, width), np.uint32 if values.dtype == np.uint8 else np.uint64)
+    for rows in row_slices(height, width):
+        packed[rows] = _pack(values[rows])
+    colors = _sort_distinct(packed.ravel())
+    del packed
     if len(colors) > MAX_COLORS:
         raise ValueError(
             f"label images must have at most {MAX_COLORS} distinct colours; got {len(colors)} in {path}, "
             "which looks like a photo, or a mask after lossy compression"
         )
-    return torch.from_numpy(ids.reshape(packed.shape).astype(np.int64))
+    labels = np.empty((height, width), np.int64)
+    for rows in row_slices(height, width):
+        labels[rows] = np.searchsorted(colors, _pack(values[rows]))
+    return torch.from_numpy(labels)
+
+
+def _pack(values: NDArray[Any]) -> NDArray[Any]:
+    """Return colours (H, W, C) as numbers in the order of R, then G, B and A; 0 for transparent ones."""
+    bits, dtype = (8, np.uint32) if values.dtype == np.uint8 else (16, np.uint64)
+    packed = np.zeros(values.shape[:2], dtype)
+    for channel in range(values.shape[-1]):
+        packed <<= bits
+        packed |= values[..., channel].astype(dtype)
+    if values.shape[-1] == 4:
+        packed[values[..., 3] == 0] = 0
+    return packed
+
+
+def _sort_distinct(numbers: NDArray[Any]) -> NDArray[Any]:
+    """Return the distinct ones of numbers, sorted; the numbers are sorted in place."""
+    numbers.sort()
+    return np.concatenate([numbers[:1], numbers[1:][numbers[1:] != numbers[:-1]]])
 
 
 def _warn_of_antialiasing(array: NDArray[Any], expression: str) -> None:

@@ -19,7 +19,7 @@ PROGRAM = """
 import re, sys, warnings
 import kcgs, torch
 from kcgs._image import as_image
-from kcgs.data import load_image
+from kcgs.data import load_image, load_labels
 
 def read(path, side):
     return {read}
@@ -58,12 +58,19 @@ def write_tiff(path: Path, side: int) -> None:
     tifffile.imwrite(path, colors(side, 3).astype(np.uint16), photometric="rgb")
 
 
+def write_npy(path: Path, side: int) -> None:
+    np.save(path, labels(side))
+
+
 # what is written, how it is read, and the bytes per pixel of the result
 CASES: dict[str, tuple[Callable[[Path, int], None], str, int]] = {
     "RGB as L": (write_png(3), "load_image(path, channels='L')", 4),
     "RGBA as RGB": (write_png(4), "load_image(path)", 12),
     "TIFF": (write_tiff, "load_image(path)", 12),
     "tensor": (write_nothing, "as_image('image', torch.zeros(3, side, side))", 12),
+    "colours": (write_png(3), "load_labels(path)", 8),
+    "colours that are ids": (write_png(3), "load_labels(path, rgb_ids=True)", 8),
+    "array": (write_npy, "load_labels(path)", 8),
 }
 
 
@@ -71,7 +78,8 @@ CASES: dict[str, tuple[Callable[[Path, int], None], str, int]] = {
 @pytest.mark.parametrize("case", CASES)
 def test_peak(case: str, tmp_path: Path) -> None:
     write, read, result_bytes = CASES[case]
-    paths = [tmp_path / str(side) for side in (64, SIDE)]
+    suffix = ".npy" if write is write_npy else ".png"
+    paths = [tmp_path / f"{side}{suffix}" for side in (64, SIDE)]
     write(paths[0], 64)
     write(paths[1], SIDE)
     command = [sys.executable, "-W", "ignore", "-c", PROGRAM.format(read=read), *paths, str(SIDE)]
