@@ -95,7 +95,7 @@ def _read_header(reader: ByteReader) -> tuple[Header, int]:
     size = reader.varint("height", 1, MAX_SIDE), reader.varint("width", 1, MAX_SIDE)
     channels = reader.varint("channels", 1, MAX_CHANNELS)
     qp = reader.varint("quantization parameter", 0, QPS[1] - QPS[0]) + QPS[0]
-    regions = reader.varint("regions", 1, MAX_REGIONS)
+    regions = reader.varint("regions", 1, min(MAX_REGIONS, size[0] * size[1]))
     map_length = 0
     if regions > 1:
         if size[0] * size[1] > MAX_LABELS:

@@ -23,9 +23,6 @@ _CRC = 4  # bytes
 _TURNS = 8  # ways to transpose and mirror a map
 _TRIED_TURNS = 2  # of which the smallest is written
 _SEED_MARGIN = 3  # seeds by which a turn that is tried may exceed the fewest
-# a map of more regions, and of more than so many per byte, is noise; an encoder's takes more bytes
-_FREE_REGIONS = (1 << 18) + 1
-_REGIONS_PER_BYTE = 4
 
 
 def encode_labels(labels: Tensor | NDArray[Any]) -> bytes:
@@ -123,12 +120,12 @@ def decode_labels(data: bytes) -> Tensor:
     if height * width > MAX_LABELS:
         raise CodecError(f"a map must have at most {MAX_LABELS} pixels; got {height} x {width}")
     stream, size = reader.data[reader.position :], (width, height) if turn & 4 else (height, width)
-    from .labels.stream import decode_stream  # loads numba
+    from .labels.stream import decode_ids, decode_numbers  # loads numba
 
-    max_regions = min(MAX_REGIONS, max(_FREE_REGIONS, _REGIONS_PER_BYTE * len(stream)))
-    ids, numbers = decode_stream(stream, size, max_regions, is_file=True)
+    pixels, ids = decode_ids(stream, size, MAX_REGIONS, is_file=True)
     dtype = _TYPES[type_index]
     max_id = 1 if dtype == "bool" else np.iinfo(dtype).max
     if ids.max() > max_id:
         raise CodecError(f"ids of {dtype} must be at most {max_id}; got {ids.max()}")
+    numbers = decode_numbers(pixels, size, len(ids), is_file=True)
     return torch.from_numpy(turned_back(ids.astype(dtype)[numbers], turn))

@@ -15,7 +15,7 @@ from kcgs.functional.softness import MAX_SOFTNESS
 from .adaptive import AdaptiveSymbol
 from .exact import Integers
 from .file import MAX_LABELS, MAX_REGIONS, ByteReader, varint
-from .labels.stream import decode_stream, encode_stream
+from .labels.stream import decode_ids, decode_numbers, encode_stream
 from .rangecoder import CodecError, Coder, Reader, Writer
 
 _UNITS = 40  # of softness, per pixel
@@ -53,8 +53,10 @@ def decode_region_map(data: bytes, size: tuple[int, int], num_regions: int) -> R
     """Read a map of `num_regions` regions for an image of `size`."""
     reader = ByteReader(data)
     stream = reader.take(reader.varint("length of the labels", 1, len(data)))
-    ids, numbers = decode_stream(stream, size, num_regions, is_file=False)
-    labels = torch.from_numpy(ids[numbers])
+    pixels, ids = decode_ids(stream, size, num_regions, is_file=False)
+    if len(ids) != num_regions:
+        raise CodecError(f"the map must have {num_regions} regions; got {len(ids)}")
+    labels = torch.from_numpy(ids[decode_numbers(pixels, size, num_regions, is_file=False)])
     count = reader.varint("numbers of softness", 1, min(_MAX_UNITS + 1, len(data)))
     palette = [reader.varint("softness", 0, _MAX_UNITS) / _UNITS for _ in range(count)]
     softness: float | dict[tuple[int, int], float] = palette[0]

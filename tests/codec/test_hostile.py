@@ -16,10 +16,11 @@ import torch
 from kcgs import RegionMap, Scene, load
 from kcgs.codec import CodecError, Decoded, decode, decode_labels, encode, encode_labels
 from kcgs.codec.exact import Integers
-from kcgs.codec.file import ByteReader, Header, pack, unpack
+from kcgs.codec.file import ByteReader, Header, pack, unpack, varint
 from kcgs.codec.gaussians.layers import Group, LayerCoder
 from kcgs.codec.gaussians.occupancy import Grid, OccupancyCoder
 from kcgs.codec.gaussians.quantize import Classes, Codes, Quantizer
+from kcgs.codec.labels import stream
 from kcgs.codec.labels.ids import _code_count
 from kcgs.codec.rangecoder import Reader, Writer
 from kcgs.codec.scenes import SceneWriter
@@ -48,6 +49,13 @@ def assert_valid(decoded: Decoded) -> None:
     if regions is not None:
         assert field.region_ids is not None and (regions.index_of(field.region_ids) >= 0).all()
         assert regions.size == field.size
+
+
+def write_count(regions: int) -> bytes:
+    """Begin the stream of a map."""
+    writer = Writer()
+    _code_count(writer, regions, regions)
+    return writer.finish()
 
 
 class TestDamagedScenes:
@@ -102,6 +110,24 @@ class TestDamagedScenes:
         for version in (0, 2, 3):
             with pytest.raises(CodecError, match=f"its version must be 1; got {version}"):
                 decode(b"kcgs" + bytes([version]) + data[5:])
+
+    @pytest.mark.parametrize(
+        ("regions", "match"),
+        [(4, "the map must have 4 regions; got 3"), (24 * 36 + 1, r"regions must be in \[1, 864\]; got 865")],
+    )
+    def test_number_of_regions(self, regions: int, match: str, data: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+        """It is checked before pixels are decoded."""
+        monkeypatch.setattr(stream, "code_pixels", None)
+        header, region_map, layers = unpack(data)
+        with pytest.raises(CodecError, match=match):
+            decode(pack(header._replace(regions=regions), region_map, layers))
+
+    def test_many_regions_of_few_bytes(self, data: bytes) -> None:
+        header, _, layers = unpack(data)
+        labels = write_count(1 << 20)
+        header = header._replace(size=(1 << 10, 1 << 10), regions=1 << 20)
+        with pytest.raises(CodecError, match="at most 262145 regions; got 1048576"):
+            decode(pack(header, varint(len(labels)) + labels, layers))
 
     def test_varints(self) -> None:
         assert ByteReader(bytes([129, 128, 128, 128, 0])).varint("width", 0, 1) == 1
@@ -167,17 +193,17 @@ class TestDamagedMaps:
         with pytest.raises(TypeError, match="data must be bytes; got str"):
             decode_labels("kcgm")  # type: ignore[arg-type]
 
-    def test_ids_beyond_the_type(self) -> None:
+    def test_ids_beyond_the_type(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """They are checked before pixels are decoded."""
         data = encode_labels(make_labels(0) * 200)
+        monkeypatch.setattr(stream, "code_pixels", None)
         with pytest.raises(CodecError, match=r"ids of uint8 must be at most 255; got 1000"):
             decode_labels(forge_map(data[4] % 8 + 8, data[5:8], data[8:-4]))
 
     def test_many_regions_of_few_bytes(self) -> None:
         """They cost neither time nor memory."""
-        writer = Writer()
-        _code_count(writer, 1 << 20, 1 << 20)
         with pytest.raises(CodecError, match="at most 262145 regions; got 1048576"):
-            decode_labels(forge_map(0, b"\x80\x10\x80\x10", writer.finish()))
+            decode_labels(forge_map(0, b"\x80\x10\x80\x10", write_count(1 << 20)))
 
     def test_in_place_of_a_scene(self, files: list[bytes], tmp_path: Path) -> None:
         path = tmp_path / "mask.kcgs"

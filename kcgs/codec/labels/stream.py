@@ -16,6 +16,9 @@ from .wavefront import number_regions
 
 _NOISE_CHANCE = np.array([2.0**-10])  # that a map is coded as noise
 _NOISE_OVERHEAD = 64  # bits by which the model may exceed noise
+# a map of more regions, and of more than so many per byte, is noise; an encoder's takes more bytes
+_FREE_REGIONS = (1 << 18) + 1
+_REGIONS_PER_BYTE = 4
 
 
 def encode_stream(ids: Integers, index: Any, *, is_file: bool) -> bytes:
@@ -49,13 +52,17 @@ def _start(numbered: list[int], is_file: bool, *, is_noise: bool) -> Writer:
     return writer
 
 
-def decode_stream(data: bytes, size: tuple[int, int], max_regions: int, *, is_file: bool) -> tuple[Integers, Any]:
-    """Read a map; return its ids, in the order in which regions are numbered, and the number of each pixel's region."""
-    reader, (height, width) = Reader(data), size
-    ids = np.array(code_ids(reader, [], min(max_regions, height * width), is_file=is_file), np.int64)
-    if len(ids) == 1:
-        return ids, np.broadcast_to(np.int32(0), size)
+def decode_ids(data: bytes, size: tuple[int, int], max_regions: int, *, is_file: bool) -> tuple[Reader, Integers]:
+    """Read the ids of a map, in the order in which regions are numbered; return the reader of its pixels, too."""
+    reader, max_of_bytes = Reader(data), max(_FREE_REGIONS, _REGIONS_PER_BYTE * len(data))
+    ids = code_ids(reader, [], min(max_regions, max_of_bytes, size[0] * size[1]), is_file=is_file)
+    return reader, np.array(ids, np.int64)
+
+
+def decode_numbers(reader: Reader, size: tuple[int, int], num_regions: int, *, is_file: bool) -> Any:
+    """Read the number of each pixel's region, (H, W) int32."""
+    if num_regions == 1:
+        return np.broadcast_to(np.int32(0), size)
     if reader.bits(_NOISE_CHANCE, np.zeros(1, np.int32))[0]:
-        return ids, reader.numbers(None, len(ids), height * width).reshape(size)
-    truth, seeds = np.zeros((0, 0), np.int32), np.zeros(size, np.uint8)
-    return ids, code_pixels(reader, truth, seeds, len(ids), is_file=is_file)
+        return reader.numbers(None, num_regions, size[0] * size[1]).reshape(size)
+    return code_pixels(reader, np.zeros((0, 0), np.int32), np.zeros(size, np.uint8), num_regions, is_file=is_file)
