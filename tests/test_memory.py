@@ -10,7 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+import torch
 from PIL import Image
+
+from kcgs.codec.file import varint
+from kcgs.codec.labels.stream import encode_stream
+
+from .codec.test_hostile import forge_map
+from .codec.test_label_files import DTYPES
 
 SIDE = 3000
 SLACK = 12_000_000  # bytes
@@ -19,6 +26,7 @@ PROGRAM = """
 import re, sys, warnings
 import kcgs, torch
 from kcgs._image import as_image
+from kcgs.codec import decode_labels
 from kcgs.data import load_image, load_labels
 
 def read(path, side):
@@ -62,6 +70,13 @@ def write_npy(path: Path, side: int) -> None:
     np.save(path, labels(side))
 
 
+def write_map(path: Path, side: int) -> None:
+    """Write a transposed map of int32."""
+    ids, index = np.unique(labels(side), return_inverse=True)
+    stream = encode_stream(ids, index.reshape(side, side).astype(np.int32), is_file=True)
+    path.write_bytes(forge_map(4 + 8 * DTYPES.index(torch.int32), 2 * varint(side), stream))
+
+
 # what is written, how it is read, and the bytes per pixel of the result
 CASES: dict[str, tuple[Callable[[Path, int], None], str, int]] = {
     "RGB as L": (write_png(3), "load_image(path, channels='L')", 4),
@@ -71,6 +86,7 @@ CASES: dict[str, tuple[Callable[[Path, int], None], str, int]] = {
     "colours": (write_png(3), "load_labels(path)", 8),
     "colours that are ids": (write_png(3), "load_labels(path, rgb_ids=True)", 8),
     "array": (write_npy, "load_labels(path)", 8),
+    "map": (write_map, "decode_labels(open(path, 'rb').read())", 4),
 }
 
 
@@ -78,7 +94,7 @@ CASES: dict[str, tuple[Callable[[Path, int], None], str, int]] = {
 @pytest.mark.parametrize("case", CASES)
 def test_peak(case: str, tmp_path: Path) -> None:
     write, read, result_bytes = CASES[case]
-    suffix = ".npy" if write is write_npy else ".png"
+    suffix = ".npy" if write is write_npy else ".kcgs"  # of images and maps the content counts
     paths = [tmp_path / f"{side}{suffix}" for side in (64, SIDE)]
     write(paths[0], 64)
     write(paths[1], SIDE)

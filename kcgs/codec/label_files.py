@@ -79,9 +79,9 @@ def turned(labels: NDArray[Any], turn: int) -> NDArray[Any]:
 
 
 def turned_back(labels: NDArray[Any], turn: int) -> NDArray[Any]:
-    """Return the map that `turned` was given."""
+    """Return a view of the map that `turned` was given."""
     labels = labels[:: -1 if turn & 2 else 1, :: -1 if turn & 1 else 1]
-    return np.ascontiguousarray(labels.T if turn & 4 else labels)
+    return labels.T if turn & 4 else labels
 
 
 def decode_labels(data: bytes) -> Tensor:
@@ -120,7 +120,7 @@ def decode_labels(data: bytes) -> Tensor:
     if height * width > MAX_LABELS:
         raise CodecError(f"a map must have at most {MAX_LABELS} pixels; got {height} x {width}")
     stream, size = reader.data[reader.position :], (width, height) if turn & 4 else (height, width)
-    from .labels.stream import decode_ids, decode_numbers  # loads numba
+    from .labels.stream import decode_ids, decode_numbers, label_pixels  # loads numba
 
     pixels, ids = decode_ids(stream, size, MAX_REGIONS, is_file=True)
     dtype = _TYPES[type_index]
@@ -128,4 +128,4 @@ def decode_labels(data: bytes) -> Tensor:
     if ids.max() > max_id:
         raise CodecError(f"ids of {dtype} must be at most {max_id}; got {ids.max()}")
     numbers = decode_numbers(pixels, size, len(ids), is_file=True)
-    return torch.from_numpy(turned_back(ids.astype(dtype)[numbers], turn))
+    return torch.from_numpy(label_pixels(ids.astype(dtype), turned_back(numbers, turn)))

@@ -6,7 +6,9 @@ import math
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from kcgs._rows import row_slices
 from kcgs.codec.exact import Integers
 from kcgs.codec.rangecoder import Reader, Writer
 
@@ -66,3 +68,11 @@ def decode_numbers(reader: Reader, size: tuple[int, int], num_regions: int, *, i
     if reader.bits(_NOISE_CHANCE, np.zeros(1, np.int32))[0]:
         return reader.numbers(None, num_regions, size[0] * size[1]).reshape(size)
     return code_pixels(reader, np.zeros((0, 0), np.int32), np.zeros(size, np.uint8), num_regions, is_file=is_file)
+
+
+def label_pixels(ids: NDArray[Any], numbers: Any) -> NDArray[Any]:
+    """Return the id of each pixel, (H, W) in the type of `ids`, for the numbers of regions, (H, W) of any strides."""
+    labels = np.empty(numbers.shape, ids.dtype)
+    for rows in row_slices(*numbers.shape):
+        labels[rows] = ids[numbers[rows]]
+    return labels
