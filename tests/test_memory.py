@@ -13,6 +13,8 @@ import tifffile
 import torch
 from PIL import Image
 
+from kcgs import GaussianField, RegionMap, Scene
+from kcgs.codec import encode
 from kcgs.codec.file import varint
 from kcgs.codec.labels.stream import encode_stream
 
@@ -28,6 +30,7 @@ import kcgs, torch
 from kcgs._image import as_image
 from kcgs.codec import decode_labels
 from kcgs.data import load_image, load_labels
+from kcgs.functional.labels import touching_pairs
 
 def read(path, side):
     return {read}
@@ -77,6 +80,15 @@ def write_map(path: Path, side: int) -> None:
     path.write_bytes(forge_map(4 + 8 * DTYPES.index(torch.int32), 2 * varint(side), stream))
 
 
+def write_scene(factor: int) -> Callable[[Path, int], None]:
+    def write(path: Path, side: int) -> None:
+        regions = torch.from_numpy(labels(side) * factor)
+        field = GaussianField.random(9, (side, side), regions=regions, seed=0)
+        path.write_bytes(encode(Scene(field, RegionMap.from_labels(regions))))
+
+    return write
+
+
 # what is written, how it is read, and the bytes per pixel of the result
 CASES: dict[str, tuple[Callable[[Path, int], None], str, int]] = {
     "RGB as L": (write_png(3), "load_image(path, channels='L')", 4),
@@ -87,6 +99,9 @@ CASES: dict[str, tuple[Callable[[Path, int], None], str, int]] = {
     "colours that are ids": (write_png(3), "load_labels(path, rgb_ids=True)", 8),
     "array": (write_npy, "load_labels(path)", 8),
     "map": (write_map, "decode_labels(open(path, 'rb').read())", 4),
+    "scene": (write_scene(1), "kcgs.load(path)", 12),
+    "scene of large ids": (write_scene(100_000), "kcgs.load(path)", 12),
+    "contours": (write_nothing, "touching_pairs((torch.arange(side) % 3).repeat(side, 1))", 8),
 }
 
 

@@ -10,12 +10,13 @@ import torch
 from kcgs._check import check_count
 from kcgs.functional import PairSoftness, RegionMap
 from kcgs.functional.labels import compact, touching_pairs
+from kcgs.functional.regions import wrap_labels
 from kcgs.functional.softness import MAX_SOFTNESS
 
 from .adaptive import AdaptiveSymbol
 from .exact import Integers
 from .file import MAX_LABELS, MAX_REGIONS, ByteReader, varint
-from .labels.stream import decode_ids, decode_numbers, encode_stream
+from .labels.stream import decode_ids, decode_numbers, encode_stream, label_pixels
 from .rangecoder import CodecError, Coder, Reader, Writer
 
 _UNITS = 40  # of softness, per pixel
@@ -56,7 +57,8 @@ def decode_region_map(data: bytes, size: tuple[int, int], num_regions: int) -> R
     pixels, ids = decode_ids(stream, size, num_regions, is_file=False)
     if len(ids) != num_regions:
         raise CodecError(f"the map must have {num_regions} regions; got {len(ids)}")
-    labels = torch.from_numpy(ids[decode_numbers(pixels, size, num_regions, is_file=False)])
+    with torch.inference_mode(False):  # as RegionMap.from_labels does
+        labels = torch.from_numpy(label_pixels(ids, decode_numbers(pixels, size, num_regions, is_file=False)))
     count = reader.varint("numbers of softness", 1, min(_MAX_UNITS + 1, len(data)))
     palette = [reader.varint("softness", 0, _MAX_UNITS) / _UNITS for _ in range(count)]
     softness: float | dict[tuple[int, int], float] = palette[0]
@@ -67,7 +69,7 @@ def decode_region_map(data: bytes, size: tuple[int, int], num_regions: int) -> R
         softness = {pair: palette[index] for pair, index in zip(pairs, indices, strict=True)}
     elif reader.position != len(data):
         raise CodecError(f"the map must end after {reader.position} bytes; got {len(data)}")
-    regions = RegionMap.from_labels(labels, softness)
+    regions = wrap_labels(labels, softness)
     if regions.num_regions != num_regions:
         raise CodecError(f"the map must have {num_regions} regions; got {regions.num_regions}")
     return regions

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import torch
 from torch import Tensor
 
 from kcgs._check import check_floating
 from kcgs._labels import check_labels
+from kcgs._rows import row_slices
 
 _TABLE_IDS = 1 << 16  # up to this id a table is ten times faster than sorting every pixel
 
@@ -40,12 +41,17 @@ def lookup_regions(means: Tensor, labels: Tensor) -> Tensor:
             f"labels of shape {tuple(labels.shape)} need means of shape ({labels.shape[0]}, N, 2); got "
             f"{tuple(means.shape)}"
         )
-    height, width = labels.shape[-2:]
-    pixel = means.detach().floor()
-    x, y = pixel[..., 0].clamp(0, width - 1).long(), pixel[..., 1].clamp(0, height - 1).long()
+    y, x = pixels_under(means, labels.shape[-2:])
     if labels.ndim == 2:
         return labels[y, x]
-    return labels.flatten(1).gather(1, y * width + x)
+    return labels.flatten(1).gather(1, y * labels.shape[-1] + x)
+
+
+def pixels_under(means: Tensor, size: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """Return row and column of the pixel under each centre, clamped to an image (height, width)."""
+    height, width = size
+    pixel = means.detach().floor()
+    return pixel[..., 1].clamp(0, height - 1).long(), pixel[..., 0].clamp(0, width - 1).long()
 
 
 def edge_band(labels: Tensor, width: float = 5) -> Tensor:
@@ -120,7 +126,11 @@ def touching_pairs(labels: Tensor) -> set[tuple[int, int]]:
         >>> touching_pairs(torch.tensor([[0, 3, 3], [0, 0, 7]])) == {(0, 3), (0, 7), (3, 7)}
         True
     """
-    return {(low, high) for low, high in unique_pairs(contour_edges(labels)[0])[0].tolist()}
+    pairs: set[tuple[int, int]] = set()
+    for rows in row_slices(*labels.shape):
+        edges = contour_edges(labels[rows.start : rows.stop + 1])[0]  # with the row below
+        pairs |= {(low, high) for low, high in unique_pairs(edges)[0].tolist()}
+    return pairs
 
 
 def unique_pairs(pairs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -162,8 +172,8 @@ def compact(labels: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         table = torch.where(present, present.cumsum(0) - 1, -1)
         index = table.to(torch.int32).index_select(0, labels.flatten()).view(labels.shape)
         return ids, index, torch.nn.functional.pad(table, (1, 1), value=-1)
-    ids, index = torch.unique(labels, return_inverse=True)
-    return ids, index.to(torch.int32), None
+    ids = labels.unique_consecutive().unique()  # neither makes an int64 index of the pixels, as an inverse is
+    return ids, torch.searchsorted(ids, labels.contiguous(), out_int32=True), None
 
 
 def sample_labels(labels: Tensor, height: int, width: int) -> Tensor:

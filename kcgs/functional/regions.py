@@ -86,8 +86,7 @@ class RegionMap:
         """
         with torch.inference_mode(False):  # a graph of autograd keeps no tensor of that mode
             labels = check_labels("labels", labels).clone()
-        tables = make_tables(labels, softness)
-        return cls(labels, tables, softness_tensor(tables.softness, labels.device))
+        return wrap_labels(labels, softness)
 
     @property
     def labels(self) -> Tensor:
@@ -293,6 +292,12 @@ class RegionMap:
             return self._source.resize((height, width))
         labels, tables = resample(self.tables, self._labels, (height, width))
         return RegionMap(labels, tables, self._softness, self)
+
+
+def wrap_labels(labels: Tensor, softness: float | Mapping[tuple[int, int], float]) -> RegionMap:
+    """Make the map of valid int64 labels without a copy: nobody else may write to them."""
+    tables = make_tables(labels, softness)
+    return RegionMap(labels, tables, softness_tensor(tables.softness, labels.device))
 
 
 def as_region_map(value: object, name: str = "regions") -> RegionMap | None:

@@ -16,7 +16,7 @@ from kcgs.codec.adaptive import AdaptiveAngle, AdaptiveMagnitude, AdaptiveNumber
 from kcgs.codec.exact import Floats, Integers, exp2
 from kcgs.codec.rangecoder import CodecError, Coder, Reader, Writer
 from kcgs.functional import RegionMap
-from kcgs.functional.labels import lookup_regions
+from kcgs.functional.labels import pixels_under
 
 from .occupancy import COUNT_BITS, OccupancyCoder
 from .quantize import ENERGIES, MAX_RATIO, OCTAVES, SIZES, Classes, Codes, Parameters, Quantizer
@@ -160,8 +160,8 @@ class LayerCoder:
         """Code the region of each Gaussian, as the position of its id: that under its centre, or another."""
         if self.regions is None:
             return np.zeros(len(means), np.int64)
-        labels = lookup_regions(torch.from_numpy(means), self.regions.labels)
-        coded = self.regions.index_of(labels).numpy().astype(np.int64)
+        row, column = pixels_under(torch.from_numpy(means), self.regions.size)
+        coded = self.regions.index[0, row, column].numpy().astype(np.int64)
         strays = self._strays.code(coder, (ids != coded).astype(np.int64))
         index = np.flatnonzero(strays)
         # a distance from the region under the centre, modulo the number of regions
