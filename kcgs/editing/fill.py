@@ -9,6 +9,7 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from kcgs.fitting.optimizers import cosine_decay
 from kcgs.functional import RegionMap, region_splat
+from kcgs.functional.weights import weight_sums
 from kcgs.kernels import threads_for_kernels
 from kcgs.nn import GaussianField
 from kcgs.nn.field import join
@@ -17,7 +18,6 @@ from kcgs.scene import Scene
 
 from .inpainting import inpaint_from_matches
 from .masks import dilate
-from .weights import weight_sums
 
 # pixels around a region that may have colours of it, as edges in photos are blurred and masks are not exact
 _FRINGE = 6
@@ -81,8 +81,8 @@ def _fringe(mask: Tensor, labels: Tensor) -> Tensor:
 def _share_in(field: GaussianField, ids: Tensor, regions: RegionMap, hole: Tensor) -> Tensor:
     """Return the share of the weight of each Gaussian that is in the hole, (N,)."""
     means, cholesky = field.means.detach(), field.cholesky.detach()
-    total, sums = weight_sums(lambda ones: region_splat(means, cholesky, ones, ids, regions), field.colors)
-    return sums(hole.to(total)[None]) / sums(torch.ones_like(total)).clamp_min(1e-9)
+    total, sums = weight_sums(lambda ones: region_splat(means, cholesky, ones, ids, regions), field.colors[:, :1])
+    return (sums(hole.to(total)[None]) / sums(torch.ones_like(total)).clamp_min(1e-9))[:, 0]
 
 
 def _spread(residual: Tensor, mask: Tensor, regions: RegionMap, density: float) -> GaussianField:

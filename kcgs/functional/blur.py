@@ -1,4 +1,4 @@
-"""The separable Gaussian filter of metrics, matching pursuit and contours."""
+"""The separable Gaussian filter of metrics and contours."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcgs.fitting.contour_moves import move_contours
 from kcgs.fitting.objective import make_objective, propose_gaussians
-from kcgs.fitting.redundancy import lowest_impact
+from kcgs.fitting.removal import lowest_impact
 from kcgs.functional import RegionMap
 from kcgs.optim.frame import widen
 from kcgs.optim.newton import Gaussians, NewtonDescent, area, error_weights, half_gradients
@@ -77,16 +77,15 @@ class FrameDescent:
         """Move the movable rows once."""
         means, cholesky, colors, region_ids, regions = self.splats
         gaussians = Gaussians(means, cholesky, colors)
-
-        def render(means: Tensor, cholesky: Tensor, colors: Tensor) -> Tensor:
-            return self.target.render(Splats(means, cholesky, colors, region_ids, regions))
-
-        gradients = half_gradients(render, gaussians, self.target.image, self.objective)
+        gradients = half_gradients(self._render, gaussians, self.target.image, self.objective)
         color_curvature = area(cholesky) * error_weights(gaussians, self.objective) * self.overlap
         means, cholesky, colors = self.newton.step(
             gaussians, gradients, color_curvature, rate, ~self.movable_rows[:, None]
         )
         self.splats = Splats(means, widen(cholesky, _MIN_SIGMA), colors, region_ids, regions)
+
+    def _render(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> Tensor:
+        return self.target.render(Splats(means, cholesky, colors, *self.splats[3:]))
 
     def _relocate(self, count: int) -> None:
         """Move so many rows, those whose neighbours replace them best, to where they lower the error most.
@@ -98,12 +97,8 @@ class FrameDescent:
         visibility, self.overlap = self._overlap()
         weights = error_weights(Gaussians(means, cholesky, colors), self.objective) * visibility
         weights = torch.where(self.movable_rows, weights, _FIXED_WEIGHT)
-        arrays = (
-            means.cpu().numpy(), cholesky.cpu().numpy(), colors.cpu().numpy(), self.splats.region_index.cpu().numpy()
-        )  # fmt: skip
-        removal, new_colors = lowest_impact(*arrays, count, weights.cpu().numpy())
-        mask = torch.from_numpy(removal).to(means.device)
-        colors = torch.from_numpy(new_colors).to(colors).masked_fill(mask[:, None], 0.0)
+        mask, colors = lowest_impact(self._render, means, cholesky, colors, count, weights)
+        colors = colors.masked_fill(mask[:, None], 0.0)
         self.newton.velocity[mask], self.movable_rows = 0.0, self.movable_rows | mask
 
         residual = (image - self.target.render(self.splats._replace(colors=colors))) * self.changed_pixels

@@ -9,10 +9,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcgs.editing.weights import weight_sums
 from kcgs.fitting import FitConfig
 from kcgs.fitting.descent import DRAFT_CUTOFF
 from kcgs.functional import RegionMap, region_splat
+from kcgs.functional.weights import weight_sums
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
@@ -83,5 +83,6 @@ class Target:
         return (self.render(splats) - self.image).square().mean(0)
 
     def weight_sums(self, splats: Splats) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
-        """Sum weights per pixel and per Gaussian: see :func:`kcgs.editing.weights.weight_sums`."""
-        return weight_sums(lambda colors: self.render(splats._replace(colors=colors)), splats.colors)
+        """Sum weights per pixel, (1, H, W), and per Gaussian, (N,): see :func:`kcgs.functional.weights.weight_sums`."""
+        total, sums = weight_sums(lambda colors: self.render(splats._replace(colors=colors)), splats.colors[:, :1])
+        return total, lambda values: sums(values)[:, 0]

@@ -221,7 +221,7 @@ def run_prune(p: Parts, tolerance: float) -> dict[str, Any]:
 
 def run_propose(p: Parts, residual: Tensor, count: int) -> tuple[Any, ...]:
     """Find Gaussians to add."""
-    field = propose(residual, _regions(p), count, sigmas=(0.7, 1.8, 4.7))
+    field = propose(residual, _regions(p), count)
     return field.means.detach(), field.cholesky.detach(), field.colors.detach(), field.region_ids
 
 

@@ -21,7 +21,7 @@ from .contours import AdaptContours
 
 @dataclass(frozen=True)
 class Densify:
-    """Add Gaussians where they lower the squared error most, by matching pursuit, region by region.
+    """Add Gaussians where they lower the squared error most, by matching pursuit.
 
     First their number grows to more than N. Then come cycles: in each, those that cost least are removed, step by step,
     until there are N, and the next cycle adds as many again. So N places are chosen several times, each time with
