@@ -48,7 +48,7 @@ class TestFitVideo:
         assert len(scenes) == 5 and scenes.num_gaussians == 80
         assert scenes.metadata == {"frame_rate": "24"}
         psnrs = [float(psnr(scene.render(), frame)) for scene, frame in zip(scenes, FRAMES, strict=True)]
-        assert min(psnrs) > psnrs[0] - 1.5 and min(psnrs) > 30
+        assert min(psnrs) > psnrs[0] - 3.5 and min(psnrs) > 30
         assert scenes.regions is not None
         for labels, expected in zip(scenes.regions.labels, MAPS, strict=True):
             assert (labels != expected).float().mean() < 0.03
