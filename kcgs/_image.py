@@ -89,7 +89,7 @@ def read_image(path: str | os.PathLike[str], channels: str = "RGB") -> Tensor:
         warn_user(f"{path} holds {samples.frames} images: the first is read")
     values, white = samples.values, samples.white
     if values.dtype.kind == "f":
-        values = np.ascontiguousarray(values, np.float32)
+        values = np.require(values, np.float32, ["C", "W"])  # Pillow's are read-only
         as_image(str(path), torch.from_numpy(values.transpose(2, 0, 1)))
     if channels != "RGBA" and values.shape[-1] in (2, 4) and values[..., -1].min() < white:
         _warn_of_alpha(str(path))

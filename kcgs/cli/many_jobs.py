@@ -52,7 +52,7 @@ def fit_one(job: FitJob) -> Outcome:
             is_same = row.get("fingerprint") == fingerprint
             if is_same and checksum == _checksum(job.output, row):
                 return Outcome(row, False)
-            is_unfinished = is_same and checksum is None
+            is_unfinished = row == {"fingerprint": fingerprint} and checksum is None
             if not (is_unfinished or job.overwrite):
                 problem = "made with other settings or changed since"
                 raise FileExistsError(f"{job.output} exists, {problem}; --overwrite replaces it")
@@ -75,10 +75,10 @@ def fit_one(job: FitJob) -> Outcome:
 def _read_row(record: Path) -> dict[str, Any]:
     """Read the row beside a scene; it is empty if there is none that can be read."""
     try:
-        row: dict[str, Any] = json.loads(record.read_bytes())
+        row = json.loads(record.read_bytes())
     except (FileNotFoundError, ValueError):
         return {}
-    return row
+    return row if isinstance(row, dict) else {}
 
 
 def _checksum(output: Path, row: dict[str, Any]) -> str:

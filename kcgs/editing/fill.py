@@ -9,7 +9,7 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from kcgs.fitting.optimizers import cosine_decay
 from kcgs.functional import RegionMap, region_splat
-from kcgs.functional.weights import weight_sums
+from kcgs.functional.weights import weighted_sums
 from kcgs.kernels import threads_for_kernels
 from kcgs.nn import GaussianField
 from kcgs.nn.field import join
@@ -81,7 +81,8 @@ def _fringe(mask: Tensor, labels: Tensor) -> Tensor:
 def _share_in(field: GaussianField, ids: Tensor, regions: RegionMap, hole: Tensor) -> Tensor:
     """Return the share of the weight of each Gaussian that is in the hole, (N,)."""
     means, cholesky = field.means.detach(), field.cholesky.detach()
-    total, sums = weight_sums(lambda ones: region_splat(means, cholesky, ones, ids, regions), field.colors[:, :1])
+    ones = torch.ones_like(field.colors[:, :1])
+    total, sums = weighted_sums(lambda colors: region_splat(means, cholesky, colors, ids, regions), ones)
     return (sums(hole.to(total)[None]) / sums(torch.ones_like(total)).clamp_min(1e-9))[:, 0]
 
 

@@ -23,11 +23,13 @@ _SIGMAS = {1: (0.7, 1.1), 2: (1.8, 2.9), 4: (4.7,), 8: (7.5,)}
 _REACH = 3.0
 # distance within which no other place gains more, in standard deviations
 _RADIUS = 1.5
+# by which equal gains are made to differ
+_SCATTER = 1e-4
 _CUTOFF = 1e-4
 
 
 class _Scale(NamedTuple):
-    """A round Gaussian of one size about the middle of each block of an image, alone."""
+    """Gains and colours of Gaussians of one size, each alone, at the middle of each block of an image."""
 
     sigma: float  # pixels
     block: int  # side of the blocks, pixels
@@ -51,6 +53,8 @@ def propose(residual: Tensor, regions: RegionMap | None, count: int, *, backend:
     with torch.no_grad():
         while (missing := count - field.num_gaussians) > 0:
             gain, means, sigma, colors = _local_maxima(residual, regions, floor)
+            if not len(gain):
+                break
             strongest = gain.sort(descending=True, stable=True)[1][:missing]
             means, sigma, colors = means[strongest], sigma[strongest], colors[strongest]
             cholesky = torch.stack([sigma, torch.zeros_like(sigma), sigma], -1)
@@ -68,14 +72,13 @@ def propose(residual: Tensor, regions: RegionMap | None, count: int, *, backend:
 def _local_maxima(residual: Tensor, regions: RegionMap | None, floor: float) -> tuple[Tensor, ...]:
     """Return gain, mean, sigma and colours of each Gaussian that gains more than all others of any size nearby."""
     labels = None if regions is None else regions.index[0].to(residual.dtype)
-    best, block = torch.zeros_like(residual[0]), 1
-    scales = []
+    best, factors, block = torch.zeros_like(residual[0]), _scatter(residual[0]), 1
+    scales, parts = [], []
     for scale in _scales(residual, labels):
-        middles = _middles(best, scale.block)
+        middles, gain = _middles(best, scale.block), scale.gain * _middles(factors, scale.block)
         # in a region of one pixel all sizes are the same: only the first counts
-        scales.append(scale._replace(gain=torch.where(scale.gain > middles, scale.gain, 0.0)))
-        torch.maximum(middles, scale.gain, out=middles)
-    parts = []
+        scales.append(scale._replace(gain=torch.where(gain > middles, gain, 0.0)))
+        torch.maximum(middles, gain, out=middles)
     for sigma, side, gain, colors in scales:
         while block < side:
             best, block = max_pool2d(best[None], 2, ceil_mode=True)[0], 2 * block
@@ -91,22 +94,30 @@ def _scales(residual: Tensor, labels: Tensor | None) -> Iterator[_Scale]:
     for block, sigmas in _SIGMAS.items():
         if min(residual.shape[1:]) < block:
             return
-        planes, own = torch.cat([residual, torch.ones_like(residual[:1])]), None
+        planes, middle_labels = torch.cat([residual, torch.ones_like(residual[:1])]), None
         if labels is not None:
             # of a block that a contour crosses, only the pixels of one region count
-            own = _middles(labels, block)
-            spread = own.repeat_interleave(block, 0).repeat_interleave(block, 1)
-            height, width = spread.shape
-            planes = planes[:, :height, :width] * (labels[:height, :width] == spread)
+            middle_labels = _middles(labels, block)
+            block_labels = middle_labels.repeat_interleave(block, 0).repeat_interleave(block, 1)
+            height, width = block_labels.shape
+            planes = planes[:, :height, :width] * (labels[:height, :width] == block_labels)
         for _ in range(block.bit_length() - 1):
             planes = halve(planes)
         for sigma in sigmas:
             deviation, reach = sigma / block, math.ceil(_REACH * sigma / block)
             # the square of a Gaussian is one, too, narrower by sqrt 2
             windows = gaussian_taps(deviation, reach), gaussian_taps(deviation / math.sqrt(2.0), reach)
-            products, norm = _blur(planes, own, *windows)
+            products, norm = _blur(planes, middle_labels, *windows)
             colors = products / norm
             yield _Scale(sigma, block, (products * colors).sum(0) * block**2, colors)
+
+
+def _scatter(plane: Tensor) -> Tensor:
+    """Return factors of almost 1 that differ from place to place, so that maxima of a flat error lie apart."""
+    row, column = (torch.arange(length, device=plane.device, dtype=torch.float64) for length in plane.shape)
+    # a sequence of low discrepancy: any few of its largest values are spread over the plane
+    fraction = (0.7548776662466927 * row[:, None] + 0.5698402909980532 * column) % 1.0
+    return (1.0 - _SCATTER * fraction).to(plane.dtype)
 
 
 def _middles(plane: Tensor, block: int) -> Tensor:
@@ -129,7 +140,7 @@ def _blur(planes: Tensor, labels: Tensor | None, taps: list[float], norm_taps: l
             count, is_same = length - distance, planes.new_ones(())
             if labels is not None:
                 before, after = (labels.narrow(dim - 1, start, count) for start in (0, distance))
-                is_same = torch.eq(before, after, out=torch.empty_like(before))  # as floats, without a conversion
+                is_same = torch.eq(before, after, out=torch.empty_like(before))  # as floats: masks need no conversion
             for source, target in ((distance, 0), (0, distance)):
                 values, sums = planes.narrow(dim, source, count), blurred.narrow(dim, target, count)
                 sums[:-1].addcmul_(values[:-1], is_same, value=taps[distance])

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kcgs.functional import region_splat
-from kcgs.functional.weights import weight_sums
+from kcgs.functional.weights import weighted_sums
 
 from .descent import DRAFT_CUTOFF
 from .state import FitState
@@ -26,10 +26,11 @@ def lowest_impact(
 ) -> tuple[Tensor, Tensor]:
     r"""Choose Gaussians to remove, and give their colours to the others.
 
-    The impact of Gaussian i is :math:`|c_i|^2 \langle g_i, g_i \rangle / (1 + \sum_j o_{ij})`, where the overlap
-    :math:`o_{ij}` is the normalised inner product of two Gaussians of half the covariances: about the share of the
-    energy of one that the other explains, and 1 for twins. The colours of the others take one gradient step of the best
-    length towards the render of those that are removed, each by the energy about it.
+    The impact of Gaussian i is :math:`|c_i|^2 \langle g_i, g_i \rangle / (1 + \sum_j o_{ij})`. The overlap
+    :math:`o_{ij}` is the normalised inner product of two Gaussians of half the covariances: 1 for twins, and near 0 for
+    distant ones. Only the half of the Gaussians with more energy count as j, for others may be removed as well. The
+    other colours take one gradient step towards the render of what is removed, scaled by each one's energy and
+    overlaps, and of the best length.
 
     Args:
         render: of the Gaussians in other shapes and colours, from means, cholesky and colors.
@@ -42,18 +43,23 @@ def lowest_impact(
     Returns:
         A mask of those to remove, (N,), and the colours of all, (N, C).
     """
-    energy = math.pi * cholesky[:, :1] * cholesky[:, 2:]
-    norm = (0.5 * energy).rsqrt()
-    total, overlaps = weight_sums(lambda ones: render(means, cholesky / math.sqrt(2.0), norm * ones), colors[:, :1])
-    crowding = overlaps(total).clamp_min(1.0)
-    impact = weight * colors.square().sum(1) * (energy / crowding)[:, 0]
-    removed = torch.zeros_like(impact, dtype=torch.bool)
-    removed[impact.argsort(stable=True)[:count]] = True
-    lost = render(means, cholesky, colors * removed[:, None])
-    products = weight_sums(lambda ones: render(means, cholesky, ones), colors)[1]
-    step = products(lost) / (energy * crowding) * ~removed[:, None]
-    rendered = render(means, cholesky, step)
-    length = (rendered * lost).sum() / rendered.square().sum().clamp_min(torch.finfo(lost.dtype).tiny)
+    area = math.pi * cholesky[:, :1] * cholesky[:, 2:]
+    energy = weight * colors.square().sum(1) * area[:, 0]
+    is_strong = torch.ones_like(energy, dtype=torch.bool)
+    is_strong[energy.argsort(stable=True)[: len(energy) // 2]] = False
+    norm = (0.5 * area).rsqrt()
+
+    def render_narrow(factors: Tensor) -> Tensor:
+        return render(means, cholesky / math.sqrt(2.0), norm * factors)
+
+    strong, overlaps = weighted_sums(render_narrow, is_strong[:, None].to(colors))
+    crowding = 1.0 + (overlaps(strong) - is_strong[:, None].to(colors)).clamp_min(0.0)
+    removed = torch.zeros_like(is_strong)
+    removed[(energy / crowding[:, 0]).argsort(stable=True)[:count]] = True
+    loss, products = weighted_sums(lambda colors: render(means, cholesky, colors), colors * removed[:, None])
+    step = products(loss) / (area * crowding) * ~removed[:, None]
+    change = render(means, cholesky, step)
+    length = (change * loss).sum() / change.square().sum().clamp_min(torch.finfo(loss.dtype).tiny)
     return removed, colors + length * step
 
 

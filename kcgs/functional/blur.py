@@ -1,4 +1,4 @@
-"""The separable Gaussian filter of metrics and contours."""
+"""The separable Gaussian filter of metrics and contours, and the windows of matching pursuit."""
 
 from __future__ import annotations
 

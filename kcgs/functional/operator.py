@@ -151,7 +151,7 @@ class _SplatDoubleBackward(torch.autograd.Function):
 
 
 def _keep_constants(ctx: Any, constants: tuple[Any, ...]) -> None:
-    """Keep ids, labels and settings for a backward, which torch would not save if they were made in inference mode."""
+    """Keep ids, labels and settings on the context; `save_for_backward` refuses tensors of inference mode."""
     ctx.constants, ctx.versions = constants, _versions(constants)
 
 

@@ -1,4 +1,4 @@
-"""The weights of each Gaussian, summed over pixels."""
+"""Sums over pixels, by the weights of each Gaussian."""
 
 from __future__ import annotations
 
@@ -9,16 +9,14 @@ from torch import Tensor
 
 
 @torch.enable_grad()
-def weight_sums(render: Callable[[Tensor], Tensor], colors: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
-    """Return the sum of all weights at each pixel, (C, H, W), and a function that sums such maps per Gaussian.
-
-    The function weighs each pixel by the weight of the Gaussian there and returns (N, C).
+def weighted_sums(render: Callable[[Tensor], Tensor], colors: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+    """Return a render, (C, H, W), and a function that sums an image over the weights of each Gaussian, (N, C).
 
     Args:
-        render: of Gaussians in other colours, (N, C).
-        colors: of the Gaussians, for its shape, (N, C).
+        render: of the Gaussians in any colours, (N, C).
+        colors: those of the render, (N, C).
     """
-    ones = torch.ones_like(colors).requires_grad_()
-    total = render(ones)
+    leaf = colors.detach().requires_grad_()
+    image = render(leaf)
     # the render is linear in the colours, so its gradient by them has the sums
-    return total.detach(), lambda values: torch.autograd.grad(total, ones, values, retain_graph=True)[0]
+    return image.detach(), lambda values: torch.autograd.grad(image, leaf, values, retain_graph=True)[0]

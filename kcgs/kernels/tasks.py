@@ -18,7 +18,6 @@ import os
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -35,7 +34,7 @@ START = 0  # tasks that must be done before
 _TAKEN = 0
 _DONE = 1
 
-# of both counters, when a task has failed
+# value of both counters after a failure, larger than any number of tasks
 _CANCELLED = 1 << 62
 
 _MOST_RANGES = 256
@@ -50,30 +49,24 @@ def run_tasks(function: Callable[[Any, Any], None], tasks: Any, *, serial: bool 
 
     An exception in one thread ends the others after their present tasks, and reaches the caller.
     """
-    counters = np.zeros(2, np.int64)
-    run = partial(_run_or_cancel, function, tasks, counters)
+    counters, errors = np.zeros(2, np.int64), list[BaseException]()
+
+    def run() -> None:
+        try:
+            function(tasks, counters)
+        except BaseException as error:
+            errors.append(error)
+            counters[:] = _CANCELLED
+
     others: list[Future[None]] = []
     # one that starts too late finds nothing to do, so nobody waits for it
-    with suppress(RuntimeError):  # while the interpreter ends, there are no other threads
+    with suppress(RuntimeError):  # no thread can be started: too many run, or the interpreter ends
         count = 0 if serial else min(num_threads(), len(tasks)) - 1
         others.extend(_pool(os.getpid(), num_threads() - 1).submit(run) for _ in range(count))
-    try:
-        run()
-    finally:
-        if counters[_DONE] >= _CANCELLED:
-            wait(others)  # they still write to what the caller is about to give up
-    if counters[_DONE] >= _CANCELLED:
-        for other in others:
-            other.result()
-
-
-def _run_or_cancel(function: Callable[[Any, Any], None], tasks: Any, counters: Any) -> None:
-    """Run tasks; where one fails, end the waiting of other threads, and their work."""
-    try:
-        function(tasks, counters)
-    except BaseException:
-        counters[:] = _CANCELLED
-        raise
+    run()
+    if errors:
+        wait(others)  # they still write to what the caller is about to give up
+        raise errors[0]
 
 
 @functools.cache

@@ -85,10 +85,10 @@ class FrameDescent:
         self.splats = Splats(means, widen(cholesky, _MIN_SIGMA), colors, region_ids, regions)
 
     def _render(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> Tensor:
-        return self.target.render(Splats(means, cholesky, colors, *self.splats[3:]))
+        return self.target.render(self.splats._replace(means=means, cholesky=cholesky, colors=colors))
 
     def _relocate(self, count: int) -> None:
-        """Move so many rows, those whose neighbours replace them best, to where they lower the error most.
+        """Move so many rows, those of the lowest impact, to where they lower the error most.
 
         Rows that lower it nowhere get the colour 0.
         """
@@ -97,8 +97,8 @@ class FrameDescent:
         visibility, self.overlap = self._overlap()
         weights = error_weights(Gaussians(means, cholesky, colors), self.objective) * visibility
         weights = torch.where(self.movable_rows, weights, _FIXED_WEIGHT)
-        mask, colors = lowest_impact(self._render, means, cholesky, colors, count, weights)
-        colors = colors.masked_fill(mask[:, None], 0.0)
+        mask, new_colors = lowest_impact(self._render, means, cholesky, colors, count, weights)
+        colors = torch.where(self.movable_rows[:, None], new_colors, colors).masked_fill(mask[:, None], 0.0)
         self.newton.velocity[mask], self.movable_rows = 0.0, self.movable_rows | mask
 
         residual = (image - self.target.render(self.splats._replace(colors=colors))) * self.changed_pixels

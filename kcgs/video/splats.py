@@ -12,7 +12,7 @@ from torch import Tensor
 from kcgs.fitting import FitConfig
 from kcgs.fitting.descent import DRAFT_CUTOFF
 from kcgs.functional import RegionMap, region_splat
-from kcgs.functional.weights import weight_sums
+from kcgs.functional.weights import weighted_sums
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
@@ -83,6 +83,7 @@ class Target:
         return (self.render(splats) - self.image).square().mean(0)
 
     def weight_sums(self, splats: Splats) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
-        """Sum weights per pixel, (1, H, W), and per Gaussian, (N,): see :func:`kcgs.functional.weights.weight_sums`."""
-        total, sums = weight_sums(lambda colors: self.render(splats._replace(colors=colors)), splats.colors[:, :1])
+        """Sum weights per pixel, (1, H, W); return also what sums such maps per Gaussian, (N,): see `weighted_sums`."""
+        ones = torch.ones_like(splats.colors[:, :1])
+        total, sums = weighted_sums(lambda colors: self.render(splats._replace(colors=colors)), ones)
         return total, lambda values: sums(values)[:, 0]

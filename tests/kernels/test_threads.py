@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from importlib import import_module
@@ -93,8 +95,8 @@ def fail_at(failing: int, done: Any, tasks: Any, counters: Any) -> None:
 @pytest.mark.usefixtures("three_threads")
 class TestTasks:
     @pytest.mark.parametrize("failing", [0, 3, 7])
-    def test_failure(self, failing: int) -> None:
-        """A task that fails, on whichever thread, ends the call by its exception, and no later phase begins."""
+    def test_failure_of_any_thread(self, failing: int) -> None:
+        """The caller gets the exception, and no later phase begins."""
         tasks = phases(*(np.zeros((2, 1), np.int64) for _ in range(4)))
         for _ in range(50):
             done = np.zeros(len(tasks), np.bool_)
@@ -104,6 +106,19 @@ class TestTasks:
         done = np.zeros(len(tasks), np.bool_)
         run_tasks(partial(fail_at, -1, done), tasks)
         assert done.all()
+
+    def test_failure_of_another_thread(self) -> None:
+        """The caller, which finds no task left, gets the exception of the other thread."""
+        tasks = phases(np.zeros((2, 1), np.int64))
+
+        def wait_or_fail(tasks: Any, counters: Any) -> None:
+            if threading.current_thread() is threading.main_thread():
+                while not counters.any():
+                    time.sleep(0.001)
+            fail_at(0, np.zeros(2, np.bool_), tasks, counters)
+
+        with pytest.raises(ValueError, match="a task fails"):
+            run_tasks(wait_or_fail, tasks)
 
 
 AT_EXIT = """
