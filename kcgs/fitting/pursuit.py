@@ -94,15 +94,15 @@ def _scales(residual: Tensor, labels: Tensor | None) -> Iterator[_Scale]:
     for block, sigmas in _SIGMAS.items():
         if min(residual.shape[1:]) < block:
             return
-        planes, middle_labels = torch.cat([residual, torch.ones_like(residual[:1])]), None
-        if labels is not None:
+        planes, mask, middle_labels = residual, torch.ones_like(residual[:1]), labels
+        if labels is not None and block > 1:
             # of a block that a contour crosses, only the pixels of one region count
             middle_labels = _middles(labels, block)
-            block_labels = middle_labels.repeat_interleave(block, 0).repeat_interleave(block, 1)
-            height, width = block_labels.shape
-            planes = planes[:, :height, :width] * (labels[:height, :width] == block_labels)
-        for _ in range(block.bit_length() - 1):
-            planes = halve(planes)
+            height, width = (length * block for length in middle_labels.shape)
+            pixels = labels[:height, :width].unflatten(1, (-1, block)).unflatten(0, (-1, block))
+            mask = (pixels == middle_labels[:, None, :, None]).to(residual.dtype).view(1, height, width)
+            planes = residual[:, :height, :width] * mask
+        planes = torch.cat([_average(planes, block), _average(mask, block)])
         for sigma in sigmas:
             deviation, reach = sigma / block, math.ceil(_REACH * sigma / block)
             # the square of a Gaussian is one, too, narrower by sqrt 2
@@ -114,16 +114,23 @@ def _scales(residual: Tensor, labels: Tensor | None) -> Iterator[_Scale]:
 
 def _scatter(plane: Tensor) -> Tensor:
     """Return factors of almost 1 that differ from place to place, so that maxima of a flat error lie apart."""
-    row, column = (torch.arange(length, device=plane.device, dtype=torch.float64) for length in plane.shape)
-    # a sequence of low discrepancy: any few of its largest values are spread over the plane
-    fraction = (0.7548776662466927 * row[:, None] + 0.5698402909980532 * column) % 1.0
-    return (1.0 - _SCATTER * fraction).to(plane.dtype)
+    # the fractions of their sums are a sequence of low discrepancy: any few of the largest are spread over the plane
+    row, column = (
+        (step * torch.arange(length, device=plane.device, dtype=torch.float64)).frac().to(plane.dtype)
+        for step, length in zip((0.7548776662466927, 0.5698402909980532), plane.shape, strict=True)
+    )
+    return (row[:, None] + column).frac_().mul_(-_SCATTER).add_(1.0)
 
 
 def _middles(plane: Tensor, block: int) -> Tensor:
     """Return the view of the pixel in the middle of each whole block, of four the last."""
     height, width = (length // block * block for length in plane.shape)
     return plane[block // 2 : height : block, block // 2 : width : block]
+
+
+def _average(planes: Tensor, block: int) -> Tensor:
+    """Return the means of blocks, whose side is a power of 2."""
+    return planes if block == 1 else _average(halve(planes), block // 2)
 
 
 def _blur(planes: Tensor, labels: Tensor | None, taps: list[float], norm_taps: list[float]) -> tuple[Tensor, Tensor]:
