@@ -13,6 +13,7 @@ from torch.nn.functional import max_pool2d, pad
 
 from kcgs.functional import RegionMap, lookup_regions, region_splat
 from kcgs.functional.blur import gaussian_taps
+from kcgs.kernels import threads_for_torch
 from kcgs.nn import GaussianField
 from kcgs.nn.field import join
 
@@ -52,7 +53,8 @@ def propose(residual: Tensor, regions: RegionMap | None, count: int, *, backend:
     field = GaussianField(empty[0], empty[1], empty[2], ids, size=size)
     with torch.no_grad():
         while (missing := count - field.num_gaussians) > 0:
-            gain, means, sigma, colors = _local_maxima(residual, regions, floor)
+            with threads_for_torch():
+                gain, means, sigma, colors = _local_maxima(residual, regions, floor)
             if not len(gain):
                 break
             strongest = gain.sort(descending=True, stable=True)[1][:missing]

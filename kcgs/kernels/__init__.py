@@ -15,9 +15,9 @@ from .interface import SplatInputs, Steps, with_autograd
 from .membership import Membership
 from .registry import BACKENDS, check_backend, prepare, resolve
 from .resampled import Resampled
-from .threads import image_threads_for_kernels, threads_for_kernels
+from .threads import image_threads_for_kernels, threads_for_kernels, threads_for_torch
 
 __all__ = [
     "BACKENDS", "Membership", "Resampled", "SplatInputs", "Steps", "check_backend",
-    "image_threads_for_kernels", "prepare", "resolve", "threads_for_kernels", "with_autograd",
+    "image_threads_for_kernels", "prepare", "resolve", "threads_for_kernels", "threads_for_torch", "with_autograd",
 ]  # fmt: skip
