@@ -56,10 +56,11 @@ def lowest_impact(
     crowding = 1.0 + (overlaps(strong) - is_strong[:, None].to(colors)).clamp_min(0.0)
     removed = torch.zeros_like(is_strong)
     removed[(energy / crowding[:, 0]).argsort(stable=True)[:count]] = True
-    loss, products = weighted_sums(lambda colors: render(means, cholesky, colors), colors * removed[:, None])
-    step = products(loss) / (area * crowding) * ~removed[:, None]
+    removed_render, products = weighted_sums(lambda colors: render(means, cholesky, colors), colors * removed[:, None])
+    step = products(removed_render) / (area * crowding) * ~removed[:, None]
     change = render(means, cholesky, step)
-    length = (change * loss).sum() / change.square().sum().clamp_min(torch.finfo(loss.dtype).tiny)
+    tiny = torch.finfo(change.dtype).tiny
+    length = (change * removed_render).sum() / change.square().sum().clamp_min(tiny)
     return removed, colors + length * step
 
 
