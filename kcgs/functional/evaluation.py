@@ -32,6 +32,8 @@ def plan_splat(arguments: SplatArguments, check: bool = True) -> Plan:
     content = steps.plan(inputs)
     if content is None:
         check_values(*arguments[:3])
+    if steps.looks_up_regions and (content is None or (check and content.foreign)):
+        _look_up(inputs, arguments, True)
     return Plan(steps, inputs, content)
 
 
@@ -103,20 +105,29 @@ def _image_with_graph(arguments: SplatArguments) -> tuple[Tensor, list[Tensor]]:
 
 def _prepare(arguments: SplatArguments, check: bool) -> tuple[SplatInputs, Steps]:
     """Return the inputs of the kernel, and the kernel."""
-    region_index = membership = None
+    ids = regions = membership = None
     if arguments.map_operands is not None and arguments.region_ids is not None:
-        tables = tables_at(arguments.map_operands)
-        region_index = tables.index_of(torch.atleast_2d(arguments.region_ids))
-        # not read on CUDA: that would be a device synchronisation
-        known = region_index.device.type == "cpu" and int(region_index.numpy().min(initial=0)) >= 0
-        if check and not known:
-            check_region_ids(arguments.region_ids, region_index)
-        membership = tables.membership
-        # one region covers everything: no map, but Gaussians of other ids still paint nothing
-        if membership.num_regions == 1 and known:
-            region_index = membership = None
-    inputs = SplatInputs(*arguments[:3], region_index, membership, arguments.size, arguments.cutoff)
+        tables, regions = tables_at(arguments.map_operands), arguments.region_ids.contiguous()
+        ids, membership = tables.ids, tables.membership
+    inputs = SplatInputs(*arguments[:3], regions, membership, arguments.size, arguments.cutoff, ids)
     steps = resolve(arguments.backend, inputs)
+    if not steps.looks_up_regions:
+        inputs = _look_up(inputs, arguments, check)
     if check and not steps.checks_inputs:
         check_values(*arguments[:3])
     return inputs if steps.checks_inputs else inputs.with_batch(), steps
+
+
+def _look_up(inputs: SplatInputs, arguments: SplatArguments, check: bool) -> SplatInputs:
+    """Put the positions of regions in place of their ids."""
+    if arguments.map_operands is None or inputs.region_index is None:
+        return inputs
+    tables, region_ids = tables_at(arguments.map_operands), torch.atleast_2d(inputs.region_index)
+    index = tables.index_of(region_ids)
+    known = index.device.type == "cpu" and int(index.numpy().min(initial=0)) >= 0
+    if check and not known:
+        check_region_ids(region_ids, index)
+    # one region covers everything: no map, but Gaussians of other ids still paint nothing
+    if tables.membership.num_regions == 1 and known:
+        return inputs._replace(region_index=None, membership=None, ids=None)
+    return inputs._replace(region_index=index, ids=None)

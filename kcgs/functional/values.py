@@ -17,7 +17,7 @@ _NOT_FINITE = "A loss or a gradient that is not finite, or a learning rate that 
 
 
 def check_values(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
-    """Refuse values that are not finite or out of range; on CUDA by assertions, without device synchronisation."""
+    """Refuse values that are not finite or out of range."""
     if means.numel() == 0:
         return
     (least, most), diagonal, l21 = SCALE_LIMITS, cholesky[..., ::2], cholesky[..., 1]
@@ -31,22 +31,14 @@ def check_values(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
 
 
 def _check(name: str, values: Tensor, valid: Tensor, expected: str, part: str = "") -> None:
-    if values.device.type != "cpu":
-        torch._assert_async(valid.all(), f"{name} must be {expected}")
-    elif not valid.all():
+    if not valid.all():
         count, (low, high) = int((~values.isfinite()).sum()), torch.aminmax(values)
         extremes = f"{part}[{float(low):g}, {float(high):g}]. {_OUT_OF_RANGE}"
         raise InvalidArgument(name, expected, f"{count} NaN or infinite values. {_NOT_FINITE}" if count else extremes)
 
 
 def check_region_ids(region_ids: Tensor, index: Tensor) -> None:
-    """Refuse negative ids, and warn of Gaussians whose id is not in the map: their `index`, (B, N), is negative.
-
-    No warning on CUDA: no device synchronisation.
-    """
-    if index.device.type != "cpu":
-        torch._assert_async((region_ids >= 0).all(), "region_ids must be non-negative")
-        return
+    """Refuse negative ids, and warn of Gaussians whose id is not in the map: their `index`, (B, N), is negative."""
     if int(region_ids.min()) < 0:
         raise ValueError(f"region_ids must be non-negative; got {int(region_ids.min())}")
     foreign = region_ids.view_as(index)[index < 0]

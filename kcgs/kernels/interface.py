@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from kcgs.maps.coverage import Coverage
+
 from .membership import Membership
 
 Gradients = tuple[Tensor | None, Tensor | None, Tensor]
@@ -27,11 +29,22 @@ class SplatInputs(NamedTuple):
     membership: Membership | None  # None: one region covers everything
     size: tuple[int, int]  # (height, width)
     cutoff: float
+    ids: Tensor | None = None  # [R] int64, sorted: where given, `region_index` holds ids that the kernel looks up
+
+    @property
+    def coverage(self) -> Coverage | None:
+        """The map's table of tiles."""
+        return None if self.membership is None else self.membership.coverage
 
     @property
     def gaussians(self) -> tuple[Tensor, Tensor, Tensor]:
         """Means, Cholesky factors and colours."""
         return self[:3]
+
+    @property
+    def num_images(self) -> int:
+        """B, 1 where it is left out."""
+        return self.means.shape[0] if self.means.ndim == 3 else 1
 
     def with_batch(self) -> SplatInputs:
         """Return the same, with B where Gaussians of one image have none."""
@@ -52,6 +65,8 @@ class Steps(NamedTuple):
         (B, C, H, W), in one pass; None: there is none.
     checks_inputs: `plan` returns None where a value is not finite or beyond the limits in whitened.py, and Gaussians of
         one image may come without B, as do the results then; else values have been checked, and B is there.
+    looks_up_regions: `region_index` comes as region ids, with `ids`; negative ones are refused by None, too, and
+        `foreign` of the plan is the number of those that the map does not hold.
     """
 
     plan: Callable[[SplatInputs], Any]
@@ -60,6 +75,7 @@ class Steps(NamedTuple):
     image: Callable[[SplatInputs], Tensor] | None = None
     error_gradients: Callable[[Any, SplatInputs, Tensor], Gradients] | None = None
     checks_inputs: bool = False
+    looks_up_regions: bool = False
 
 
 @contextmanager

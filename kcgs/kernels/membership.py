@@ -14,9 +14,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcgs.maps.coverage import Coverage
+
 from .antialiasing import SmoothLabels
 
 T = TypeVar("T")
+
+TILE = 16
 
 # reach of a contour, in widths: the blur's kernel is cut there
 RADIUS_SIGMAS = 4.0
@@ -125,6 +129,19 @@ class Membership:
     def tiles(self, tile: int) -> TileMembership:
         """Return the tables for square tiles of `tile` pixels."""
         return self.derived(("tiles", tile), lambda _: self._build_tiles(tile))
+
+    @property
+    def coverage(self) -> Coverage:
+        """The same table as `Coverage`."""
+        return self.derived("coverage", lambda m: m._cover())
+
+    def _cover(self) -> Coverage:
+        keys, planes, masks = self.tiles(TILE)
+        maps, height, width = self.index.shape
+        count = maps * -(-height // TILE) * -(-width // TILE)
+        bounds = torch.arange(count + 1, device=keys.device) * self.num_regions
+        starts = torch.searchsorted(keys, bounds, out_int32=True)
+        return Coverage(starts, (keys % self.num_regions).int(), planes.int(), masks.float())
 
     def full_map(self, batch: int, region: int, tile: int = 16) -> Tensor:
         """Assemble s_r of one region from the tables of tiles, (H, W) float64."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import functools
 from importlib import import_module
-from importlib.util import find_spec
 
 import torch
 
+from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument
 
 from .interface import SplatInputs, Steps
@@ -41,14 +41,20 @@ def prepare(backend: str, device: torch.device, dtype: torch.dtype, channels: in
 def _choose(backend: str, device: torch.device, dtype: torch.dtype) -> str:
     if check_backend(backend) != "auto":
         return backend
-    if dtype == torch.float32 and (device.type == "cpu" or (device.type == "cuda" and _has_triton())):
+    if dtype == torch.float32 and (device.type == "cpu" or (device.type == "cuda" and _compiles(device))):
         return device.type
     return "tiled"
 
 
 @functools.cache
-def _has_triton() -> bool:
-    return find_spec("triton") is not None
+def _compiles(device: torch.device) -> bool:
+    """Try the kernel `cuda` on a device, and warn, once, where it cannot be compiled."""
+    try:
+        prepare("cuda", device, torch.float32, 3)
+    except Exception as error:  # whatever a compiler, a driver or a card lacks
+        warn_user(f"backend 'auto' takes 'tiled' on {device}, which is slower: {type(error).__name__}: {error}")
+        return False
+    return True
 
 
 def check_backend(backend: str) -> str:

@@ -12,8 +12,8 @@ from .whitened import Z_LIMIT
 
 TILE = 16  # pixels along a side
 # by which bounds of a support exceed it, so that they hold for weights in float32: a share, and pixels
-_RELATIVE_MARGIN = 1e-5
-_MARGIN = 1e-3
+RELATIVE_MARGIN = 1e-5
+MARGIN = 1e-3
 
 
 class TileGrid(NamedTuple):
@@ -32,7 +32,7 @@ class TileGrid(NamedTuple):
 def grid_of(inputs: SplatInputs) -> TileGrid:
     """Return the tiles that cover the batch."""
     height, width = inputs.size
-    return TileGrid(inputs.means.shape[0], -(-height // TILE), -(-width // TILE))
+    return TileGrid(inputs.num_images, -(-height // TILE), -(-width // TILE))
 
 
 def bounding_tiles(
@@ -51,7 +51,7 @@ def bounding_tiles(
         Ordered by Gaussian: its index (P,), the tile's column and row (P, 2), the tile's centre minus the mean (P, 2).
     """
     l11, l21, l22 = cholesky.unbind(-1)
-    extent = torch.stack([l11, torch.hypot(l21, l22)], -1) * radius * (1 + _RELATIVE_MARGIN) + _MARGIN
+    extent = torch.stack([l11, torch.hypot(l21, l22)], -1) * radius * (1 + RELATIVE_MARGIN) + MARGIN
     last = torch.as_tensor(size, device=means.device, dtype=means.dtype).flip(-1) - 1
     if between:
         last = (last / TILE).floor() * TILE + (TILE - 1)
@@ -74,7 +74,7 @@ def reaches(origin: Tensor, cholesky: Tensor, radius: float) -> Tensor:
     slope = l21 / l11
     half = (TILE - 1) / 2
     nearest = (origin[:, 1] - slope * origin[:, 0]).abs() - half * (1 + slope.abs())
-    return nearest <= radius * (1 + _RELATIVE_MARGIN) * l22 + _MARGIN
+    return nearest <= radius * (1 + RELATIVE_MARGIN) * l22 + MARGIN
 
 
 def find_keys(keys: Tensor, tile: Tensor, region: Tensor, num_regions: int) -> tuple[Tensor, Tensor]:

@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
+from kcgs import GaussianField, RegionMap, RegionSplatRenderer
+from kcgs.functional import region_splat
 from kcgs.functional.operator import splat_operator
-from kcgs.kernels import Membership, SplatInputs, cuda, reference, tiled
+from kcgs.kernels import Membership, SplatInputs, cuda, reference, settle, without_waiting
+from kcgs.kernels.cuda import capacity, gather, plan, render
+from kcgs.optim import GaussianAdam
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 GPU = DEVICE.type == "cuda"
-# The interpreter takes most of a second for a piece of a tile's list, however few pixels and Gaussians it has: cases
-# are as small as what they are about lets them be, and larger where a GPU renders them.
-if cuda._interpreted():
+needs_gpu = pytest.mark.skipif(not GPU, reason="a CUDA graph needs a GPU")
+if plan.is_interpreted():
     # it would patch the whole language anew at every call of a function; plain Python is a part of what calls it
-    cuda._weigh = cuda._weigh.fn
+    render.weigh = gather.weigh = render.weigh.fn
 
 
 def make_inputs(
@@ -32,6 +37,7 @@ def make_inputs(
     maps: int = 1,
     cutoff: float = 0.0,
 ) -> SplatInputs:
+    """Make inputs with positions of regions, as `reference` takes them."""
     generator = torch.Generator().manual_seed(0)
     height, width = size
 
@@ -52,18 +58,33 @@ def make_inputs(
     return SplatInputs(*arrays, index, membership, size, cutoff)
 
 
-def render(kernel: ModuleType, inputs: SplatInputs) -> list[Tensor]:
+def with_ids(inputs: SplatInputs) -> SplatInputs:
+    """Return the same with ids, 5, 8, 11 ..., and 7 where there is no region."""
+    if inputs.region_index is None or inputs.membership is None:
+        return inputs
+    ids = torch.where(inputs.region_index >= 0, 3 * inputs.region_index + 5, 7)
+    return inputs._replace(region_index=ids, ids=3 * torch.arange(inputs.membership.num_regions, device=DEVICE) + 5)
+
+
+def probe(inputs: SplatInputs) -> Tensor:
+    """Make a gradient of the image, of both signs."""
+    shape = (len(inputs.means), inputs.colors.shape[-1], *inputs.size)
+    return torch.linspace(-1, 2, math.prod(shape), dtype=inputs.means.dtype, device=DEVICE).view(shape)
+
+
+def evaluate(kernel: ModuleType, inputs: SplatInputs) -> list[Tensor]:
     """Return the image and the gradients."""
+    inputs = with_ids(inputs) if kernel is cuda else inputs
     steps = kernel.steps(inputs)
-    plan = steps.plan(inputs)
-    image = steps.render(plan, inputs)
-    probe = torch.linspace(-1, 2, image.numel(), dtype=image.dtype, device=DEVICE).view_as(image)
-    return [image, *steps.differentiate(plan, inputs, probe, True)]
+    lists = steps.plan(inputs)
+    return [steps.render(lists, inputs), *steps.differentiate(lists, inputs, probe(inputs), True)]
 
 
-def assert_matches_reference(inputs: SplatInputs, tolerance: float = 5e-6) -> None:
-    got = render(cuda, inputs)
-    want = render(reference, SplatInputs(*(t.double() for t in inputs[:3]), *inputs[3:]))
+def to_double(inputs: SplatInputs) -> SplatInputs:
+    return SplatInputs(*(t.double() for t in inputs.gaussians), *inputs[3:])
+
+
+def assert_close(got: list[Tensor], want: list[Tensor], tolerance: float) -> None:
     for a, b in zip(got, want, strict=True):
         assert a.dtype == torch.float32 and a.shape == b.shape
         assert b.abs().max() > 1e-3
@@ -72,53 +93,53 @@ def assert_matches_reference(inputs: SplatInputs, tolerance: float = 5e-6) -> No
         assert cosine >= 1 - tolerance
 
 
+def assert_matches_reference(inputs: SplatInputs, tolerance: float = 5e-6) -> None:
+    assert_close(evaluate(cuda, inputs), evaluate(reference, to_double(inputs)), tolerance)
+
+
+# no map, hard and soft contours; one map and one for each image; one channel, a part of a block, more than a block
 @pytest.mark.parametrize(
-    ("size", "softness"), [((1, 1), 0.0), ((17, 18), 0.7), *([((17, 33), 0.0), ((17, 33), 0.7)] if GPU else [])]
+    "case",
+    [
+        {"size": (1, 1)},
+        {"size": (15, 17), "regions": 3, "channels": 1, "cutoff": 1e-3},
+        {"size": (9, 33), "regions": 3, "softness": 0.7, "batch": 3, "channels": 5, "n": 8},
+        {"size": (9, 20), "regions": 2, "softness": 1.5, "batch": 2, "maps": 2, "channels": 9, "n": 6},
+        *([{"size": (40, 52), "regions": 3, "softness": 0.7, "batch": 3, "maps": 3, "n": 300}] if GPU else []),
+        *([{"size": (300, 400), "regions": 3, "n": 700, "batch": 2, "cutoff": 1e-4, "channels": 32}] if GPU else []),
+    ],
+    ids=str,
 )
-def test_sizes(size: tuple[int, int], softness: float) -> None:
-    assert_matches_reference(make_inputs(size=size, regions=1 if size == (1, 1) else 3, softness=softness))
+def test_agrees_with_the_reference(case: dict[str, Any]) -> None:
+    assert_matches_reference(make_inputs(**case))
 
 
-@pytest.mark.parametrize(("regions", "cutoff"), [(1, 1e-3), (2, 0.0), *([(1, 0.0), (2, 1e-3)] if GPU else [])])
-def test_cutoffs(regions: int, cutoff: float) -> None:
-    assert_matches_reference(make_inputs(40, (16, 20) if GPU else (9, 16), regions=regions, cutoff=cutoff))
+def test_error() -> None:
+    """The gradients of half the squared error are those of its image, render minus target."""
+    inputs = make_inputs(12, regions=2, softness=0.5)
+    target = 0.5 * probe(inputs)
+    double = to_double(inputs)
+    error = reference.steps(double).render(None, double) - target
+    want = reference.steps(double).differentiate(None, double, error, True)
+    inputs = with_ids(inputs)
+    steps = cuda.steps(inputs)
+    assert steps.error_gradients is not None
+    assert_close([*steps.error_gradients(steps.plan(inputs), inputs, target)], [*want], 5e-6)
 
 
-# one; more than a block, and part of the last; part of a block; blocks
-@pytest.mark.parametrize("channels", [1, 11, *([5, 32] if GPU else [])])
-def test_channels(channels: int) -> None:
-    assert_matches_reference(make_inputs(size=(16, 16), channels=channels))
-
-
-@pytest.mark.parametrize(("maps", "size"), [(2, (16, 20)), *([(1, (9, 16)), (1, (16, 20))] if GPU else [])])
-def test_batch(maps: int, size: tuple[int, int]) -> None:
-    assert_matches_reference(make_inputs(size=size, batch=2, maps=maps, regions=3, softness=0.7))
-
-
-def test_tile_inside_one_region_beside_mixed_tiles() -> None:
-    inputs = make_inputs(size=(16, 48), regions=2)
-    assert inputs.membership is not None
-    assert len(inputs.membership.tiles(16).keys) > (inputs.membership.tiles(16).mask_rows < 0).sum() > 0
-    assert_matches_reference(inputs)
-
-
-@pytest.mark.parametrize(("regions", "batch"), [(2, 1), *([(1, 1), (3, 2)] if GPU else [])])
-def test_wide_gaussians_on_coarse_grids(regions: int, batch: int) -> None:
-    size = (70, 90) if GPU else (9, 33)
-    inputs = make_inputs(5, size, regions=regions, softness=0.7, channels=2, batch=batch, cutoff=1e-4)
-    inputs = inputs._replace(cholesky=inputs.cholesky * 3.0 ** torch.arange(5.0, device=DEVICE)[:, None] / 9)
-    wide = cuda.list_pairs(inputs).wide
-    assert wide is not None and 0 < len(wide.ids) < inputs.colors[..., 0].numel()
-    double = SplatInputs(*(t.double() for t in inputs[:3]), *inputs[3:])
-    for a, b in zip(render(cuda, inputs), render(tiled, double), strict=True):
-        assert (a - b).abs().max() <= 5e-6 * b.abs().max()
-
-
-def test_list_longer_than_a_piece() -> None:
-    count = 300 if GPU else 70
-    inputs = make_inputs(count, size=(9, 16), regions=2, softness=0.5)
-    assert count > 2 * cuda._PIECE
-    assert_matches_reference(inputs, 2e-5)
+def test_more_than_a_block_in_a_tile() -> None:
+    """300 Gaussians of one tile, needles, giants and dots among them, and some outside of the image."""
+    inputs = make_inputs(300, size=(4, 5), channels=1)
+    scales = 10.0 ** torch.linspace(-2, 5, 300, device=DEVICE)
+    cholesky = inputs.cholesky.clone()
+    cholesky[0, ::3] = torch.tensor([0.7, 0.2, 0.5], device=DEVICE)
+    cholesky[0, 1::3, 0] = scales[1::3]
+    cholesky[0, 2::3, 2] = scales[2::3]
+    inputs = inputs._replace(cholesky=cholesky, colors=inputs.colors / 300)
+    got, want = evaluate(cuda, inputs), evaluate(reference, to_double(inputs))
+    assert (got[0] - want[0]).abs().max() <= 5e-6
+    assert all(torch.isfinite(t).all() for t in got)
+    assert_close([got[3]], [want[3]], 2e-5)
 
 
 def test_slanted_needles() -> None:
@@ -126,23 +147,31 @@ def test_slanted_needles() -> None:
     cos, sin = angles.cos(), angles.sin()
     l11 = torch.hypot(1e4 * cos, sin)
     cholesky = torch.stack([l11, (1e8 - 1) * sin * cos / l11, 1e4 / l11], -1).float()[None].to(DEVICE)
-    inputs = make_inputs(size=(16, 20) if GPU else (16, 16))._replace(cholesky=cholesky)
-    want = reference.splat(SplatInputs(*(t.double() for t in inputs[:3]), *inputs[3:])).detach()
-    got = render(cuda, inputs)
-    assert (got[0] - want).abs().max() < 1e-5 * 20
+    inputs = make_inputs(size=(16, 20) if GPU else (9, 16))._replace(cholesky=cholesky)
+    got = evaluate(cuda, inputs)
+    assert (got[0] - evaluate(reference, to_double(inputs))[0]).abs().max() < 1e-5 * 20
     assert all(torch.isfinite(t).all() for t in got)
 
 
+def test_far_weights_are_zero() -> None:
+    """At cutoff 0 a weight below e^-80 is 0, however large its colour."""
+    means, cholesky = torch.tensor([[[30.0, 8.0]]], device=DEVICE), torch.tensor([[[1.0, 0.0, 1.0]]], device=DEVICE)
+    inputs = SplatInputs(means, cholesky, torch.full((1, 1, 1), 1e30, device=DEVICE), None, None, (16, 16), 0.0)
+    for tensor in evaluate(cuda, inputs):
+        assert torch.equal(tensor, torch.zeros_like(tensor))
+
+
 def test_gradient_layouts_and_colours_alone() -> None:
-    inputs = make_inputs(size=(16, 20) if GPU else (9, 16))
+    inputs = make_inputs(size=(9, 16))
     steps = cuda.steps(inputs)
-    plan = steps.plan(inputs)
+    lists = steps.plan(inputs)
     ones = torch.ones(1, 3, *inputs.size, device=DEVICE)
-    gradients = steps.differentiate(plan, inputs, ones, True)
+    gradients = steps.differentiate(lists, inputs, ones, True)
     for layout in (ones[0, 0, 0, 0].expand(ones.shape), ones.permute(0, 2, 3, 1).contiguous().permute(0, 3, 1, 2)):
-        assert torch.equal(steps.differentiate(plan, inputs, layout, True)[0], gradients[0])
+        assert torch.equal(steps.differentiate(lists, inputs, layout, True)[0], gradients[0])
     assert gradients[0].any()
-    assert torch.equal(steps.differentiate(plan, inputs, ones, False)[2], gradients[2])
+    means, cholesky, colors = steps.differentiate(lists, inputs, ones, False)
+    assert means is None and cholesky is None and torch.equal(colors, gradients[2])
 
 
 @pytest.mark.parametrize("count", [0, 3])
@@ -150,16 +179,82 @@ def test_gradient_layouts_and_colours_alone() -> None:
 def test_nothing_to_render(count: int, regions: int) -> None:
     inputs = make_inputs(count, regions=regions)
     inputs = inputs._replace(means=torch.full_like(inputs.means, 1e6))
-    image, *gradients = render(cuda, inputs)
+    image, *gradients = evaluate(cuda, inputs)
     assert torch.equal(image, torch.zeros(1, 3, 16, 20, device=DEVICE))
-    for gradient, array in zip(gradients, inputs[:3], strict=True):
+    for gradient, array in zip(gradients, inputs.gaussians, strict=True):
         assert torch.equal(gradient, torch.zeros_like(array))
 
 
 def test_same_bits_every_time() -> None:
-    inputs = make_inputs(400 if GPU else 20, size=(9, 16), regions=3, softness=0.7)
-    first, second = render(cuda, inputs), render(cuda, inputs)
-    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+    inputs = make_inputs(4000 if GPU else 20, (270, 480) if GPU else (9, 16), regions=3, softness=0.7)
+    first = evaluate(cuda, inputs)
+    for _ in range(5 if GPU else 1):
+        assert all(torch.equal(a, b) for a, b in zip(first, evaluate(cuda, inputs), strict=True))
+
+
+# room for lists
+
+
+def test_without_waiting() -> None:
+    """A plan that does not wait has room for 1.5 times the most; beyond that all is NaN until there is more room."""
+    capacity._most.clear()
+    inputs = make_inputs(8, size=(9, 48))
+    inputs = inputs._replace(
+        cholesky=torch.full_like(inputs.cholesky, 0.4).mul_(torch.tensor([1, 0, 1], device=DEVICE))
+    )
+    large = inputs._replace(cholesky=40 * inputs.cholesky)
+    expected = evaluate(cuda, inputs)
+    with without_waiting():
+        assert all(torch.equal(a, b) for a, b in zip(evaluate(cuda, inputs), expected, strict=True))
+        assert not settle(inputs.means.device, inputs.size)
+        assert all(t.isnan().all() for t in evaluate(cuda, large))
+        assert settle(inputs.means.device, inputs.size)
+        assert all(t.isfinite().all() for t in evaluate(cuda, large))
+        assert not settle(inputs.means.device, inputs.size)
+        assert evaluate(cuda, inputs._replace(colors=inputs.colors / 0))[0].isnan().all()
+    with pytest.warns(UserWarning, match="1 renders of a CUDA graph are NaN: their Gaussians were not finite"):
+        evaluate(cuda, inputs)
+
+
+def test_too_many_slots() -> None:
+    inputs = make_inputs(3, size=(1 << 19, 1 << 19))
+    inputs = inputs._replace(cholesky=torch.full_like(inputs.cholesky, 1e6))
+    message = r"3 Gaussians touch 3221225472 tiles of 16 x 16 pixels at 524288 x 524288: more than the device has room"
+    with pytest.raises(ValueError, match=message):
+        plan.plan(inputs)
+
+
+# the operator
+
+
+def small_splat(**changes: Tensor) -> dict[str, Any]:
+    labels = (torch.arange(16, device=DEVICE) // 9).expand(8, 16).contiguous()
+    arguments = {
+        "means": torch.tensor([[4.0, 4.0], [12.0, 4.0]], device=DEVICE),
+        "cholesky": torch.tensor([[2.0, 0.0, 2.0], [3.0, 1.0, 2.0]], device=DEVICE),
+        "colors": torch.ones(2, 3, device=DEVICE),
+        "region_ids": torch.tensor([0, 1], device=DEVICE),
+        "regions": RegionMap.from_labels(labels, 0.7),
+    }
+    return {**arguments, **changes, "backend": "cuda"}
+
+
+def test_refuses_what_the_cpu_refuses() -> None:
+    """An error or a warning comes at the call, and the next call is as good as ever."""
+    expected = region_splat(**small_splat())
+    with pytest.raises(ValueError, match="means must be finite"):
+        region_splat(**small_splat(means=torch.full((2, 2), math.nan, device=DEVICE)))
+    with pytest.raises(ValueError, match="colors must be finite"):
+        region_splat(**small_splat(colors=torch.full((2, 3), math.inf, device=DEVICE)))
+    with pytest.raises(ValueError, match=r"cholesky must be .* \[-1, 2\]"):
+        region_splat(**small_splat(cholesky=torch.tensor([[-1.0, 0, 1], [1, 0, 2]], device=DEVICE)))
+    with pytest.raises(ValueError, match="region_ids must be non-negative; got -2"):
+        region_splat(**small_splat(region_ids=torch.tensor([0, -2], device=DEVICE)))
+    with pytest.warns(
+        UserWarning, match="1 of 2 Gaussians paint nothing: regions does not hold their region ids, such"
+    ):
+        region_splat(**small_splat(region_ids=torch.tensor([0, 9], device=DEVICE)))
+    assert torch.equal(region_splat(**small_splat()), expected)
 
 
 def test_operator() -> None:
@@ -170,8 +265,127 @@ def test_operator() -> None:
     settings = ids, labels, None, 8, 16, 0.0
     backward = torch.ops.kcgs.region_splat_backward.default
     grad = torch.rand(1, 3, 8, 16, device=DEVICE)
-    torch.library.opcheck(splat_operator, (*inputs[:3], *settings, "cuda"), test_utils="test_schema")
-    torch.library.opcheck(backward, (grad, *inputs[:3], *settings, "cuda", True), test_utils="test_schema")
-    gradients, expected = (backward(grad, *inputs[:3], *settings, name, True) for name in ("cuda", "reference"))
+    torch.library.opcheck(splat_operator, (*inputs.gaussians, *settings, "cuda"), test_utils="test_schema")
+    torch.library.opcheck(backward, (grad, *inputs.gaussians, *settings, "cuda", True), test_utils="test_schema")
+    gradients, expected = (backward(grad, *inputs.gaussians, *settings, name, True) for name in ("cuda", "reference"))
     for a, b in zip(gradients, expected, strict=True):
         assert b.any() and (a - b).abs().max() <= 1e-5 * b.abs().max()
+
+
+def test_number_of_launches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A forward takes at most 6 launches and 12 operations of torch, a backward 3 and 8; launches do nothing here."""
+    launches: list[str] = []
+
+    class Launch:
+        def __init__(self, name: str) -> None:
+            self.name = name
+
+        def __getitem__(self, grid: tuple[int, ...]) -> Callable[..., None]:
+            launches.append(self.name)
+            return lambda *arguments, **constants: None
+
+    def count(action: Callable[[], Any]) -> tuple[Any, int, int]:
+        launches.clear()
+        with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
+            result = action()
+        operations = [e for e in profile.events() if e.name.startswith("aten::")]
+        return result, len(launches), len(operations)
+
+    arguments = small_splat()
+    leaves = [arguments[name].requires_grad_() for name in ("means", "cholesky", "colors")]
+    region_splat(**arguments)
+    for module, names in (
+        (plan, ("_prepare", "_bin", "_tile")),
+        (render, ("_render",)),
+        (gather, ("_gather", "_reduce")),
+    ):
+        for name in names:
+            monkeypatch.setattr(module, name, Launch(name))
+    image, programs, operations = count(lambda: region_splat(**arguments))
+    assert programs <= 6 and operations <= 12
+    grad = torch.ones_like(image)
+    _, programs, operations = count(lambda: torch.autograd.grad(image, leaves, grad))
+    assert programs <= 3 and operations <= 8
+
+
+# CUDA graphs
+
+
+def train(field: GaussianField, target: Tensor, steps: int, captured: bool) -> Tensor:
+    """Train a field, eagerly or by the replays of a CUDA graph, and return its means."""
+    renderer, optimizer = RegionSplatRenderer(), GaussianAdam(field)
+
+    def step() -> None:
+        optimizer.zero_grad(set_to_none=False)
+        (renderer(field) - target).square().mean().backward()
+        optimizer.step()
+
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        for _ in range(3):
+            step()
+    torch.cuda.current_stream().wait_stream(stream)
+    graph = torch.cuda.CUDAGraph()
+    if captured:
+        with torch.cuda.graph(graph):
+            step()
+    for _ in range(steps):
+        if captured:
+            graph.replay()
+        else:
+            step()
+    return field.means.detach().clone()
+
+
+@needs_gpu
+def test_graph_of_a_step() -> None:
+    target = torch.rand(1, 3, 64, 96, device=DEVICE)
+    means = [train(GaussianField.random(200, (64, 96), seed=0).to(DEVICE), target, 20, c) for c in (False, True)]
+    assert torch.equal(means[0], means[1])
+
+
+@needs_gpu
+def test_graph_is_nan_where_lists_do_not_fit() -> None:
+    capacity._most.clear()
+    inputs = make_inputs(50, size=(64, 64))._replace(
+        cholesky=torch.tensor([0.5, 0.0, 0.5], device=DEVICE).expand(1, 50, 3)
+    )
+    cholesky = inputs.cholesky.clone()
+
+    def action() -> Tensor:
+        return region_splat(inputs.means, cholesky, inputs.colors, size=inputs.size, backend="cuda")
+
+    with (
+        pytest.raises(RuntimeError, match="cannot be captured before it was rendered once"),
+        torch.cuda.graph(torch.cuda.CUDAGraph()),
+    ):
+        action()
+    expected = action()
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        image = action()
+    graph.replay()
+    assert torch.equal(image, expected)
+    cholesky.mul_(40.0)
+    graph.replay()
+    assert image.isnan().all()
+    with pytest.warns(UserWarning, match="renders of a CUDA graph are NaN: their Gaussians touch up to"):
+        assert action().isfinite().all()
+
+
+@needs_gpu
+def test_compiled_step() -> None:
+    field, target = GaussianField.random(100, (48, 64), seed=0).to(DEVICE), torch.rand(1, 3, 48, 64, device=DEVICE)
+    renderer = RegionSplatRenderer()
+
+    def loss() -> Tensor:
+        return (renderer(field) - target).square().mean()
+
+    compiled = torch.compile(loss, mode="reduce-overhead")
+    for _ in range(4):
+        torch.compiler.cudagraph_mark_step_begin()
+        gradients = torch.autograd.grad(compiled(), [*field.parameters()])
+        gradients = [g.clone() for g in gradients]
+    for a, b in zip(gradients, torch.autograd.grad(loss(), [*field.parameters()]), strict=True):
+        assert (a - b).abs().max() <= 1e-5 * b.abs().max()

@@ -1,0 +1,29 @@
+"""The kernel `cuda`: six Triton programs, float32, which plan, render and differentiate on the device.
+
+`plan` finds the Gaussians of every tile, `render` sums them at its pixels, `gather` differentiates. A list's place in
+memory is reserved by an atomic addition; no sum is: each has one owner and one order, so the same bits come every time.
+"""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+import torch
+
+from ..interface import SplatInputs, Steps
+
+
+def steps(inputs: SplatInputs) -> Steps:
+    """Return the kernel, if it takes these inputs."""
+    dtype, device = inputs.means.dtype, inputs.means.device
+    if dtype != torch.float32:
+        raise ValueError(f"backend 'cuda' computes in float32; got {dtype}: use 'tiled' or 'reference'")
+    if find_spec("triton") is None:
+        raise ImportError("backend 'cuda' needs Triton: pip install triton")
+    from .gather import differentiate, error_gradients
+    from .plan import is_interpreted, plan
+    from .render import render
+
+    if device.type != "cuda" and not is_interpreted():
+        raise ValueError(f"backend 'cuda' needs tensors on a CUDA device; got {device}")
+    return Steps(plan, render, differentiate, None, error_gradients, checks_inputs=True, looks_up_regions=True)

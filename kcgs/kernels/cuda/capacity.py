@@ -1,0 +1,111 @@
+"""Room for the lists of a plan where nothing may wait for the device: in a CUDA graph, and from step to step of a fit.
+
+An eager call waits for the number of slots. Elsewhere there is room for 1.5 times the most that was seen for the size.
+What does not fit, or is not finite, gives NaN, and is noted on the device; whoever waits next reads the note.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+import torch
+from torch import Tensor
+
+from kcgs._warn import warn_user
+
+from ..interface import SplatInputs
+
+_ROOM = 1.5
+
+# slots of the largest plan of a device, a number of images and a size
+_most: dict[tuple[torch.device, int, tuple[int, int]], int] = {}
+# of each device, int64: plans whose lists did not fit, whose values were not finite, and the most slots of one
+_notes: dict[torch.device, Tensor] = {}
+_waits: ContextVar[bool] = ContextVar("whether plans wait for the device", default=True)
+
+
+@contextmanager
+def without_waiting() -> Iterator[None]:
+    """Plan as in a CUDA graph, except for a size that has not been seen."""
+    token = _waits.set(False)
+    try:
+        yield
+    finally:
+        _waits.reset(token)
+
+
+def reserve(inputs: SplatInputs) -> int | None:
+    """Return the slots to make room for; None: wait for their number."""
+    captured = inputs.means.is_cuda and torch.cuda.is_current_stream_capturing()
+    if _waits.get() and not captured:
+        return None
+    most = _most.get(_key(inputs))
+    if captured and most is None:
+        images, (height, width) = inputs.num_images, inputs.size
+        raise RuntimeError(
+            f"region_splat of {images} x {height} x {width} cannot be captured before it was rendered once: the room "
+            "for its lists is not known; call it before the capture, with Gaussians as large as there will be"
+        )
+    return None if most is None else int(_ROOM * most) + 1
+
+
+def remember(inputs: SplatInputs, slots: int) -> None:
+    """Make room, from now on, for plans of so many slots."""
+    key = _key(inputs)
+    _most[key] = max(slots, _most.get(key, 0))
+
+
+@contextmanager
+def room_for(inputs: SplatInputs, slots: int) -> Iterator[None]:
+    """Allocate lists of so many slots, which count in 32 bits; a ValueError says why there are so many."""
+    count, (height, width) = inputs.colors.shape[:-1].numel(), inputs.size
+    message = (
+        f"{count} Gaussians touch {slots} tiles of 16 x 16 pixels at {height} x {width}: more than the device has room "
+        "for; they are too wide, or too many, for an image of this size"
+    )
+    if slots >= 1 << 31:
+        raise ValueError(message)
+    try:
+        yield
+    except torch.OutOfMemoryError as error:
+        raise ValueError(message) from error
+
+
+def reports() -> bool:
+    """Whether a plan that waits reads what was noted; within `without_waiting`, `settle` does."""
+    return _waits.get()
+
+
+def report(full: int, not_finite: int, most: int) -> None:
+    """Warn of what was noted."""
+    if full:
+        warn_user(
+            f"{full} renders of a CUDA graph are NaN: their Gaussians touch up to {most} tiles of 16 x 16 pixels, and "
+            "there was room for fewer; capture the graph anew, after a render of such Gaussians"
+        )
+    if not_finite:
+        warn_user(f"{not_finite} renders of a CUDA graph are NaN: their Gaussians were not finite, or out of range")
+
+
+def settle(device: torch.device, size: tuple[int, int]) -> bool:
+    """Wait for the device, make room for what did not fit since the last time, and return whether anything failed."""
+    if device not in _notes:
+        return False
+    full, not_finite, most = _notes[device].tolist()
+    _notes[device].zero_()
+    _most[device, 1, size] = max(most, _most.get((device, 1, size), 0))
+    return bool(full or not_finite)
+
+
+def notes_of(device: torch.device) -> Tensor:
+    """Return what plans of the device have noted."""
+    if device not in _notes:
+        with torch.inference_mode(False):
+            _notes[device] = torch.zeros(3, dtype=torch.int64, device=device)
+    return _notes[device]
+
+
+def _key(inputs: SplatInputs) -> tuple[torch.device, int, tuple[int, int]]:
+    return inputs.means.device, inputs.num_images, inputs.size

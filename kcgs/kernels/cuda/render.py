@@ -1,0 +1,92 @@
+"""The image, or its error: a program sums the pairs of a tile at its 256 pixels."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from ..interface import SplatInputs
+from ..whitened import least_exponent
+from .plan import OPTIONS, SIDE, Plan, fails, program
+
+# channels that a thread holds at once, in registers
+_MAX_CHANNELS = 8
+_WARPS = 2
+# pairs whose loads are under way at once
+_UNROLL = tl.constexpr(4)
+# a smaller weight is 0
+_LEAST_WEIGHT = math.exp(least_exponent(0.0, torch.float32))
+
+
+def render(plan: Plan, inputs: SplatInputs, target: Tensor | None = None) -> Tensor:
+    """Render (B, C, H, W), without B where the Gaussians have none, minus the target where there is one."""
+    grid, channels, (height, width) = plan.grid, inputs.colors.shape[-1], inputs.size
+    image = torch.empty(*inputs.colors.shape[:-2], channels, height, width, device=inputs.colors.device)
+    block = channels_at_once(channels)
+    with torch.cuda.device_of(image):
+        _render[(grid.total, triton.cdiv(channels, block))](
+            image, None if target is None else target.contiguous(), inputs.colors.contiguous(), *lists_of(plan, inputs),
+            height, width, channels, BLOCK=block, MAPPED=inputs.coverage is not None, num_warps=_WARPS, **OPTIONS,
+        )  # fmt: skip
+    return image
+
+
+def lists_of(plan: Plan, inputs: SplatInputs) -> tuple[Any, ...]:
+    """Return what the programs of image and gradients read of a plan and a map."""
+    grid, weights = plan.grid, None if inputs.coverage is None else inputs.coverage.weights
+    arrays = plan.counters, plan.lists, plan.slots, plan.coefficients, weights
+    return *arrays, plan.room, plan.num_cells, grid.total, grid.rows, grid.cols, max(inputs.cutoff, _LEAST_WEIGHT)
+
+
+def channels_at_once(channels: int) -> int:
+    """Return the channels of a program, a power of two."""
+    return min(_MAX_CHANNELS, 1 << (channels - 1).bit_length())
+
+
+@triton.jit
+def weigh(k0, k1, k2, k3, k4, x, y, cutoff):  # type: ignore[no-untyped-def]
+    """Evaluate whitened coordinates times SCALE, and the weight."""
+    z1 = k0 + k1 * x
+    z2 = k2 + k4 * y + k3 * x
+    weight = tl.exp2(-(z1 * z1 + z2 * z2))
+    return z1, z2, tl.where(weight >= cutoff, weight, 0.0)
+
+
+@program("room num_cells num_tiles rows cols height width channels")
+def _render(  # type: ignore[no-untyped-def]
+    image, target, colors, counters, lists, slots, coefficients, weights,
+    room, num_cells, num_tiles, rows, cols, cutoff, height, width, channels,
+    BLOCK: tl.constexpr, MAPPED: tl.constexpr,
+):  # fmt: skip
+    tile = tl.program_id(0)
+    pixel = tl.arange(0, SIDE * SIDE)
+    across, down = pixel % SIDE, pixel // SIDE
+    x, y = across - (SIDE - 1) / 2, down - (SIDE - 1) / 2
+    channel = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)[:, None]
+    value = tl.zeros([BLOCK, SIDE * SIDE], tl.float32)
+    first = tl.load(lists + num_cells + tile)
+    count = tl.load(lists + 2 * num_cells + num_tiles + tile)
+    k = coefficients + first.to(tl.int64) * 5
+    for pair in tl.range(first, first + count, loop_unroll_factor=_UNROLL):
+        _, _, weight = weigh(tl.load(k), tl.load(k + 1), tl.load(k + 2), tl.load(k + 3), tl.load(k + 4), x, y, cutoff)
+        if MAPPED:
+            place = tl.load(slots + 2 * room + pair) * (SIDE * SIDE) + pixel  # below 0 where the region is alone
+            weight *= tl.load(weights + place, mask=place >= 0, other=1.0)
+        gaussian = tl.load(slots + room + pair).to(tl.int64)
+        color = tl.load(colors + gaussian * channels + channel, mask=channel < channels, other=0.0)
+        value += color * weight[None, :]
+        k += 5
+
+    row, column = tile // cols % rows * SIDE + down, tile % cols * SIDE + across
+    plane = (tile // (rows * cols)).to(tl.int64) * channels + channel
+    address = (plane * height + row[None, :]) * width + column[None, :]
+    inside = (channel < channels) & ((row < height) & (column < width))[None, :]
+    if target is not None:
+        value -= tl.load(target + address, mask=inside, other=0.0)
+    value = tl.where(fails(counters, room), float("nan"), value)
+    tl.store(image + address, value, mask=inside)
