@@ -3,14 +3,20 @@
 import argparse
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
 from .core.run import Options, run_experiment
 
 # modules of this package with `jobs`, `measure` and `page`
 EXPERIMENTS = (
     "quality", "convergence", "published", "ablation", "rate", "pairs", "previews", "maps", "labels", "enlarge", "fill",
-    "video", "render", "gpu", "decode",
+    "video", "render", "gpu", "gpu-fit", "decode",
 )  # fmt: skip
+
+
+def module_of(name: str) -> ModuleType:
+    """Import the module of an experiment, whose name has "_" for "-"."""
+    return import_module(f"benchmarks.{name.replace('-', '_')}")
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -25,7 +31,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--redraw", action="store_true", help="only write the report, from the results in the folder")
     values = vars(parser.parse_args(arguments))
     name, options = values.pop("name"), Options(**values)
-    module = import_module(f"benchmarks.{name}")
+    module = module_of(name)
     try:
         if name == "zoo":
             module.make_zoo(options)

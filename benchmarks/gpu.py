@@ -3,102 +3,210 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from .core.clocks import milliseconds
-from .core.compare import group_by, means_table, values_of
+from kcgs import Scene
+
+from .core.clocks import milliseconds, threads
+from .core.compare import means_table, values_of
+from .core.cuda import capture, check_device, count_kernels, finish, megabytes
 from .core.figures import Panel, save_lines
+from .core.goals import Goal, goals_table, missed_goals
 from .core.run import Job, Options, Page, Row
-from .core.scenes import FITTED, scene_of
-from .render import ANISOTROPIES, CUTOFFS, DEFAULT_CUTOFF, LARGEST_REFERENCE, differentiate, errors, needles, render
+from .core.scenes import BATCH, FITTED, fits_in, scene_of
+from .render import ANISOTROPIES, CUTOFFS, DEFAULT_CUTOFF, differentiate, differentiate_exactly, errors, needles, render
 
 # kernel and device
 METHODS = {"cuda": "cuda", "tiled": "cuda", "cpu": "cpu"}
+# of scenes that slower kernels render, too
+COMPARED = {"W3": ("tiled", "cpu"), "W1": ("tiled", "cpu"), "W2": ("cpu",), "W4": ("cpu",)}
+# standard deviations in pixels, of Gaussians three times as long as wide
+GIANTS = (1e2, 1e4)
 ROUNDS = 20
-METHOD = """Forward is one image, both one image and its gradients, through `region_splat` and autograd, in
-milliseconds: medians of 20, all kernels and cutoffs of a scene in turns, the GPU waited for. `cuda` and `tiled` run on
-the GPU, `cpu` on all cores of the same machine. Scenes, errors and needles are those of the report of render. MB is
-what one image and its gradients add at the peak of the GPU's memory."""
+# in a row, without a pause between them
+CALLS = 10
+SLOW_ROUNDS = 5
+# at most, on an H100 or H200
+SCENES_480P = ("W1", "W2", "dog-1250", "dog-7500")
+_GOALS_480P = {"forward_ms": 0.50, "both_ms": 0.75, "captured_forward_ms": 0.12, "captured_both_ms": 0.22}
+GOALS = {
+    **dict.fromkeys(SCENES_480P, _GOALS_480P),
+    "W4": {"forward_ms": 1.3, "both_ms": 2.4, "peak_MB": 200.0},
+    BATCH: {"forward_ms": 0.6, "both_ms": 1.0},
+}
+EAGER = ("forward_ms", "both_ms")
+TIMES = (
+    *EAGER, "captured_forward_ms", "captured_both_ms", "captured_difference",
+    "kernels", "copies", "kernels_ms", "peak_MB",
+)  # fmt: skip
+METHOD = f"""Forward is one image, both one image and its gradients, through `region_splat` and autograd, in
+milliseconds: medians of {ROUNDS} times {CALLS} calls of `cuda` in a row, the GPU waited for after the last, and
+of {SLOW_ROUNDS} single calls of the others. Captured is the replay of the same call as a CUDA graph, with inputs in
+place. `cuda` and `tiled` run on the GPU, `cpu` on all cores of the same machine. Kernels, copies (fills among them) and
+the sum of their own times are of one image and its gradients, by torch's profiler; MB is what these add at the peak of
+the GPU's memory. Scenes and needles are those of the report of render; giants are as many Gaussians that wide at least,
+and three times as long. W1, W2 and W3 have hard contours or, by their name, soft ones. `batch` has 64 images of
+128 x 128 with 256 Gaussians each, and a map each or none. dog-1250 and dog-7500 are fits by `best` of the first frame
+of DAVIS dog with its mask, kodim05-10000 one without regions, in DATA/scenes. Errors are the largest, against the
+dense reference in float64 at cutoff 0: of the image / of gradients, relative to the largest of their tensor."""
 
 
-def finish(action: Callable[[], object]) -> None:
-    """Wait for the GPU, too."""
-    action()
-    torch.cuda.synchronize()
+def make_scene(image: str, data: str) -> Scene:
+    """Make "needles ANISOTROPY" or "giants SIGMA", or what `scene_of` knows."""
+    kind, _, number = image.partition(" ")
+    if kind == "needles":
+        return needles(float(number))
+    return needles(3.0, float(number)) if kind == "giants" else scene_of(image, data)
 
 
-def megabytes(action: Callable[[], object]) -> float:
-    """Measure what an action adds at the peak of the GPU's memory."""
-    torch.cuda.reset_peak_memory_stats()
-    before = torch.cuda.memory_allocated()
-    finish(action)
-    return (torch.cuda.max_memory_allocated() - before) / 2**20
+def measure_errors(scene: Scene, method: str, cutoffs: list[float]) -> list[Row]:
+    """Compare with the reference at each cutoff."""
+    truth = differentiate_exactly(scene)
+    return [{"cutoff": cutoff, **errors(truth, scene, method, cutoff)} for cutoff in cutoffs]
 
 
-def measure(image: str, cutoffs: list[float], rounds: int) -> list[Row]:
-    """Time the kernels of a scene, in turns, and take their errors and memory."""
-    if not torch.cuda.is_available():
-        raise ValueError("benchmark gpu needs a CUDA device; torch finds none")
-    if image.startswith("needles"):
-        scene, names = needles(float(image.split()[1])).to("cuda"), ("cuda", "tiled")
-        return [{"image": image, "method": name, "cutoff": 0.0, **errors(scene, name, 0.0)} for name in names]
-    scenes = {name: scene_of(image).to(device) for name, device in METHODS.items()}
-    has_reference = math.prod(scenes["cpu"].size) * scenes["cpu"].field.num_gaussians < LARGEST_REFERENCE
-    keys = [(name, cutoff) for name in METHODS for cutoff in cutoffs]
-    with torch.no_grad():
-        forward = milliseconds({k: partial(finish, partial(render, scenes[k[0]], *k)) for k in keys}, rounds)
-    both = milliseconds({k: partial(finish, partial(differentiate, scenes[k[0]], *k)) for k in keys}, rounds)
-    rows = []
-    for name, cutoff in keys:
-        row = {"image": image, "method": name, "cutoff": cutoff}
-        row |= {"forward_ms": forward[name, cutoff], "both_ms": both[name, cutoff]}
-        if METHODS[name] == "cuda":
-            row |= errors(scenes[name], name, cutoff) if has_reference else {}
-            row["peak_MB"] = megabytes(partial(differentiate, scenes[name], name, cutoff))
-        rows.append(row)
-    return rows
+def measure_times(scene: Scene, method: str, rounds: int, calls: int) -> list[Row]:
+    """Time eager calls, and take the memory that one adds."""
+    forward = partial(torch.no_grad()(render), scene, method, DEFAULT_CUTOFF)
+    both = partial(differentiate, scene, method, DEFAULT_CUTOFF)
+    with threads(os.cpu_count() or 1):
+        row = _milliseconds({"forward_ms": forward, "both_ms": both}, rounds, calls)
+    return [row | ({"peak_MB": megabytes(both)} if scene.field.means.is_cuda else {})]
+
+
+def measure_captured(scene: Scene, method: str, rounds: int, calls: int) -> list[Row]:
+    """Time replays, and compare what the last one left with an eager call."""
+    both = partial(differentiate, scene, method, DEFAULT_CUTOFF)
+    forward_graph, _ = capture(partial(torch.no_grad()(render), scene, method, DEFAULT_CUTOFF))
+    both_graph, (image, gradients) = capture(both)
+    replays = {"captured_forward_ms": forward_graph.replay, "captured_both_ms": both_graph.replay}
+    row = _milliseconds(replays, rounds, calls)
+    eager_image, eager_gradients = both()
+    pairs = zip([image, *gradients], [eager_image, *eager_gradients], strict=True)
+    row["captured_difference"] = max(float((a - b).abs().nan_to_num(torch.inf).max()) for a, b in pairs)
+    return [row]
+
+
+def measure_kernels(scene: Scene, method: str, calls: int) -> list[Row]:
+    """Count the kernels of an image and its gradients."""
+    return [count_kernels(partial(differentiate, scene, method, DEFAULT_CUTOFF), calls)]
+
+
+TASKS: dict[str, Callable[..., list[Row]]] = {
+    "errors": measure_errors, "times": measure_times, "captured": measure_captured, "kernels": measure_kernels
+}  # fmt: skip
+
+
+def measure(image: str, method: str, device: str, task: str, settings: dict[str, Any], data: str) -> list[Row]:
+    """Do one of TASKS with one kernel."""
+    check_device(device)
+    scene = make_scene(image, data).to(device)
+    row = {"image": image, "method": method, "n": scene.field.means.numel() // 2, "cutoff": DEFAULT_CUTOFF}
+    return [row | result for result in TASKS[task](scene, method, **settings)]
 
 
 def jobs(options: Options) -> list[Job]:
-    """Time workloads and fitted scenes, and look at needles."""
-    images = ["W3"] if options.quick else ["W3", "W1", *FITTED, "W2", "W4"]
-    cutoffs = {image: CUTOFFS if image in ("W3", "W1", *FITTED) else (DEFAULT_CUTOFF,) for image in images}
-    cutoffs |= {f"needles {a:g}": (0.0,) for a in ANISOTROPIES}
-    return [{"image": i, "cutoffs": c, "rounds": 1 if options.quick else ROUNDS} for i, c in cutoffs.items()]
+    """List errors, then times, then what might disturb times: captures, and counts by the profiler."""
+    fits = [] if options.quick else [f"{name} soft" for name in fits_in(options.data)]
+    timed = ["W3"] if options.quick else ["W3", "W1", "W1 soft", "W2", *fits, "W4", f"{BATCH} none", BATCH]
+    swept = ["W3"] if options.quick else ["W3", "W1", "W1 soft", *(f"{name} soft" for name in FITTED), *fits[:1]]
+    stiff = [*(f"needles {a:g}" for a in ANISOTROPIES), *(f"giants {sigma:g}" for sigma in GIANTS)]
+    speed = {"rounds": 1 if options.quick else ROUNDS, "calls": CALLS}
+    slow = {"rounds": 1 if options.quick else SLOW_ROUNDS, "calls": 1}
+    plan: list[tuple[str, str, str, dict[str, Any]]] = [
+        *((image, "cuda", "errors", {"cutoffs": CUTOFFS}) for image in swept),
+        *((image, "cuda", "errors", {"cutoffs": (0.0,)}) for image in stiff),
+        *((image, "cuda", "times", speed) for image in timed),
+        *((image, method, "times", slow) for image in timed for method in COMPARED.get(image, ())),
+        *((image, "cuda", "captured", speed) for image in timed),
+        *((image, "cuda", "kernels", {"calls": CALLS}) for image in timed),
+    ]
+    data = str(options.data or "")
+    return [
+        {"image": i, "method": m, "device": METHODS[m], "task": task, "settings": settings, "data": data}
+        for i, m, task, settings in plan
+    ]
 
 
 def page(folder: Path, rows: list[Row]) -> Page:
     """Write the report."""
-    timed = [row for row in rows if "both_ms" in row]
-    default = [row for row in timed if abs(row["cutoff"] / DEFAULT_CUTOFF - 1) < 0.01]
-    swept = [row for row in timed if "image_error" in row]
-    panels = [
-        Panel(str(image), group, "both_ms", "image_error", ("log", "log"))
-        for (image,), group in group_by(swept, ["image"]).items()
+    swept = [row for row in rows if "image_error" in row]
+    timed = [row for row in rows if row.keys() & {*TIMES} and abs(row["cutoff"] / DEFAULT_CUTOFF - 1) < 0.01]
+    captured = [
+        {"method": "cuda, captured", "n": row["n"], **{name: row[f"captured_{name}"] for name in EAGER}}
+        for row in timed
+        if "captured_both_ms" in row
     ]
-    save_lines(folder / "gpu.png", panels, "method", "cutoff")
-    times = {(row["image"], row["method"]): row["both_ms"] for row in default}
-    to_tiled, to_cpu = (
-        {image: times[image, other] / times[image, "cuda"] for image, name in times if name == "cuda"}
-        for other in ("tiled", "cpu")
+    panels = [Panel("", [*timed, *captured], "n", name, ("log", "log")) for name in EAGER]
+    save_lines(folder / "gpu.png", panels, "method", "n")
+    ours = [row for row in timed if row["method"] == "cuda"]
+    goals = [
+        Goal(row["image"], name, limit, row[name])
+        for row in ours
+        for name, limit in GOALS.get(_scene_name(row), {}).items()
+        if name in row
+    ]
+    tables = [
+        means_table(timed, ["image", "method"], "", TIMES),
+        "Errors of the image / of gradients:",
+        means_table(swept, ["image", "method"], "cutoff", ("image_error", "gradient_error")),
+        *(["Goals:", goals_table(goals)] if goals else []),
+    ]
+    sentences = [
+        *_speed([row for row in ours if _scene_name(row) in SCENES_480P]),
+        *_ratios(timed),
+        *_exactness([row for row in swept if row["method"] == "cuda"]),
+    ]
+    question = "How fast and how exactly does a GPU render?"
+    return Page(question, " ".join(sentences), "gpu.png", "\n\n".join(tables), missed_goals(goals), METHOD)
+
+
+def _speed(rows: list[Row]) -> Iterator[str]:
+    """Yield the times at 480 x 854, eager and captured."""
+    texts = {name: _span(values) for name in TIMES if (values := values_of(rows, name))}
+    if "both_ms" in texts:
+        yield f"`cuda` renders 480 x 854 pixels in {texts['forward_ms']} ms, with gradients in {texts['both_ms']} ms."
+    if "captured_both_ms" in texts:
+        yield f"A CUDA graph takes {texts['captured_forward_ms']} and {texts['captured_both_ms']} ms."
+
+
+def _ratios(rows: list[Row]) -> Iterator[str]:
+    """Yield how much longer other kernels take."""
+    times = {(row["image"], row["method"]): row["both_ms"] for row in rows if "both_ms" in row}
+    for other, place in {"tiled": "on the same GPU", "cpu": "on all cores beside it"}.items():
+        images = [image for image, method in times if method == other and (image, "cuda") in times]
+        ratios = [times[image, other] / times[image, "cuda"] for image in images]
+        if ratios:
+            yield f"With gradients `{other}` {place} takes {_span(ratios)} times as long."
+
+
+def _exactness(rows: list[Row]) -> Iterator[str]:
+    """Yield the largest errors of the image."""
+    default, stiff = (
+        values_of([row for row in rows if math.isclose(row["cutoff"], cutoff)], "image_error")
+        for cutoff in (DEFAULT_CUTOFF, 0.0)
     )
-    stiff = [row for row in rows if "both_ms" not in row]
-    tiled, cpu = (f"{min(r.values()):.1f} to {max(r.values()):.1f} times" for r in (to_tiled, to_cpu))
-    error, stiff_error = (
-        max(values_of([row for row in part if row["method"] == "cuda"], "image_error"), default=math.nan)
-        for part in (default, stiff)
-    )
-    answer = (
-        f"Forward and backward, `cuda` is {tiled} as fast as `tiled` on the same GPU, and {cpu} as fast as `cpu` on "
-        f"all cores beside it. Its largest error is {error:.1g} at the default cutoff, and {stiff_error:.1g} without a "
-        "cutoff, even of Gaussians a million times longer than wide."
-    )
-    columns = ("forward_ms", "both_ms", "image_error", "gradient_error", "peak_MB")
-    table = means_table([*default, *stiff], ["image", "method"], "", columns)
-    slow = [f"{image}: {ratio:.2f}" for image, ratio in to_cpu.items() if ratio < 1]
-    losses = f"The GPU is slower than the CPU, times as fast: {', '.join(slow)}." if slow else ""
-    return Page("How fast and how exactly does a GPU render?", answer, "gpu.png", table, losses, METHOD)
+    if default:
+        yield f"The largest error of its image is {max(default):.1g} at the default cutoff."
+    if stiff:
+        yield f"Of needles and giants, without a cutoff, it is {max(stiff):.1g}."
+
+
+def _scene_name(row: Row) -> str:
+    return str(row["image"]).partition(" ")[0]
+
+
+def _milliseconds(actions: Mapping[str, Callable[[], object]], rounds: int, calls: int) -> Row:
+    """Time a call of each, of so many in a row."""
+    times = milliseconds({name: partial(finish, action, calls) for name, action in actions.items()}, rounds)
+    return {name: time / calls for name, time in times.items()}
+
+
+def _span(values: list[float]) -> str:
+    return " to ".join(dict.fromkeys(f"{value:.2g}" for value in (min(values), max(values))))

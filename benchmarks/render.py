@@ -66,19 +66,24 @@ def render_by_name(name: str, backend: str) -> None:
     differentiate(scene_of(name), backend, DEFAULT_CUTOFF)
 
 
-def needles(anisotropy: float) -> Scene:
-    """Make Gaussians of one shape, turned from 0 to pi."""
+def needles(anisotropy: float, width: float = 0.5) -> Scene:
+    """Make Gaussians of one shape, turned from 0 to pi, of this least standard deviation in pixels."""
     angle = torch.linspace(0, math.pi, 37, dtype=torch.float64)
-    scales = torch.tensor([0.5 * anisotropy, 0.5], dtype=torch.float64).expand(37, 2)
+    scales = torch.tensor([width * anisotropy, width], dtype=torch.float64).expand(37, 2)
     generator = torch.Generator().manual_seed(0)
     means = torch.rand(37, 2, generator=generator) * torch.tensor([NEEDLES_SIZE[1], NEEDLES_SIZE[0]])
     cholesky = scale_rotation_to_cholesky(scales, angle).float()
     return Scene(GaussianField(means, cholesky, torch.ones(37, 1), size=NEEDLES_SIZE))
 
 
-def errors(scene: Scene, backend: str, cutoff: float) -> dict[str, float]:
-    """Return the largest errors."""
-    exact, exact_gradients = differentiate(copy.deepcopy(scene).double(), "reference", 0.0)
+def differentiate_exactly(scene: Scene) -> tuple[Tensor, list[Tensor]]:
+    """Return the image and the gradients of the dense reference in float64, without a cutoff."""
+    return differentiate(copy.deepcopy(scene).double(), "reference", 0.0)
+
+
+def errors(truth: tuple[Tensor, list[Tensor]], scene: Scene, backend: str, cutoff: float) -> dict[str, float]:
+    """Return the largest errors against `differentiate_exactly`."""
+    exact, exact_gradients = truth
     image, gradients = differentiate(scene, backend, cutoff)
     pairs = zip(gradients, exact_gradients, strict=True)
     worst = max(float((g - e).abs().max() / e.abs().max().clamp_min(1e-12)) for g, e in pairs)
@@ -95,9 +100,11 @@ def measure(image: str, cutoffs: list[float], rounds: int) -> list[Row]:
     """Time a scene on one and two threads, in turns; on one, take errors and memory, too."""
     if image.startswith("needles"):
         scene = needles(float(image.split()[1]))
-        return [{"image": image, "method": b, "threads": 1, "cutoff": 0.0, **errors(scene, b, 0.0)} for b in backends()]
+        truth, row = differentiate_exactly(scene), {"image": image, "threads": 1, "cutoff": 0.0}
+        return [{**row, "method": name, **errors(truth, scene, name, 0.0)} for name in backends()]
     scene = scene_of(image)
     has_reference = math.prod(scene.size) * scene.field.num_gaussians < LARGEST_REFERENCE
+    exact = differentiate_exactly(scene) if has_reference else None
     keys = [(backend, cutoff, count) for backend in backends() for cutoff in cutoffs for count in THREADS]
     with torch.no_grad():
         forward = milliseconds({k: partial(on_threads, k[2], partial(render, scene, *k[:2])) for k in keys}, rounds)
@@ -106,7 +113,7 @@ def measure(image: str, cutoffs: list[float], rounds: int) -> list[Row]:
     for backend, cutoff, count in keys:
         row = {"image": image, "method": backend, "threads": count, "cutoff": cutoff}
         row |= {"forward_ms": forward[backend, cutoff, count], "both_ms": both[backend, cutoff, count]}
-        row |= errors(scene, backend, cutoff) if count == 1 and has_reference else {}
+        row |= errors(exact, scene, backend, cutoff) if count == 1 and exact else {}
         if count == 1 and cutoff == DEFAULT_CUTOFF and rounds > 1:
             row["peak_MB"] = peak_megabytes(render_by_name, image, backend, warm_up=("W3", backend))
         rows.append(row)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import sys
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -16,19 +18,46 @@ WORKLOADS = {"W3": (200, 300, 20), "W1": (480, 854, 1_250), "W2": (480, 854, 7_5
 _COVERAGE = 12.0
 # 3.7, 6.3 and 11.4 Gaussians per thousand pixels; W1 has 3.0, W2 18
 FITTED = ("rocket-1000", "coffee-1500", "astronaut-3000")
+# fits of photos that do not come with kcgs, in DATA/scenes/NAME.safetensors: of the first frame of DAVIS dog with its
+# mask, and of a photo of Kodak without regions
+FITS = ("dog-1250", "dog-7500", "kodim05-10000")
+# a workload of small images: how many, height, width, N
+BATCH = "batch"
+BATCH_SIZE = (64, 128, 128, 256)
 SIZES = ("native", "3840 wide")
 
 
-def scene_of(name: str) -> Scene:
-    """Make a workload, or read a scene of the zoo; "none", "hard" or "soft" behind the name are its contours."""
+def scene_of(name: str, data: str = "") -> Scene:
+    """Make a workload, or read a scene of the zoo or of the data.
+
+    "none", "hard" or "soft" behind the name are its contours; soft ones of a fit are its own.
+    """
     name, _, contours = name.partition(" ")
-    scene = workload(*WORKLOADS[name]) if name in WORKLOADS else load(find(name))
+    is_fitted = name not in (*WORKLOADS, BATCH)
+    scene = load(_path(data, name) if name in FITS else find(name)) if is_fitted else _synthetic(name)
     field, regions = scene.field, scene.regions
     if contours == "none" or regions is None:
         return Scene(GaussianField(field.means, field.cholesky, field.colors, size=field.size))
-    if contours == "soft" and name not in WORKLOADS:
+    if contours == "soft" and is_fitted:
         return scene
     return Scene(field, RegionMap.from_labels(regions.labels, 0.7 if contours == "soft" else 0.0))
+
+
+def fits_in(data: Path | None) -> list[str]:
+    """List the FITS that are in the data; a line on standard error names the others."""
+    folder = str(data or "")
+    missing = [name for name in FITS if not _path(folder, name).is_file()]
+    if missing:
+        print(f"without {', '.join(missing)}: DATA/scenes/NAME.safetensors is missing", file=sys.stderr)
+    return [name for name in FITS if name not in missing]
+
+
+def _path(data: str, name: str) -> Path:
+    return Path(data, "scenes", f"{name}.safetensors")
+
+
+def _synthetic(name: str) -> Scene:
+    return batch(*BATCH_SIZE) if name == BATCH else workload(*WORKLOADS[name])
 
 
 def size_of(scene: Scene, size: str) -> tuple[int, int]:
@@ -37,9 +66,9 @@ def size_of(scene: Scene, size: str) -> tuple[int, int]:
     return (height, width) if size == "native" else (round(3840 / width * height), 3840)
 
 
-def workload(height: int, width: int, count: int) -> Scene:
+def workload(height: int, width: int, count: int, seed: int = 0) -> Scene:
     """Scatter Gaussians of about one size over five blocks and a disc."""
-    generator = torch.Generator().manual_seed(0)
+    generator = torch.Generator().manual_seed(seed)
 
     def uniform(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator)
@@ -53,4 +82,18 @@ def workload(height: int, width: int, count: int) -> Scene:
     disc = (x - width / 2) ** 2 + (y - height / 2) ** 2 < (height / 4) ** 2
     labels = torch.where(disc, 5, blocks)
     field = GaussianField(means, cholesky, uniform(count, 3), lookup_regions(means, labels), size=(height, width))
+    return Scene(field, RegionMap.from_labels(labels))
+
+
+def batch(images: int, height: int, width: int, count: int) -> Scene:
+    """Put workloads into a batch, each with its own map: the blocks and the disc of one, moved to the side."""
+    scenes = [workload(height, width, count, seed) for seed in range(images)]
+    means, cholesky, colors = (
+        torch.stack([getattr(scene.field, name).detach() for scene in scenes])
+        for name in ("means", "cholesky", "colors")
+    )
+    regions = scenes[0].regions
+    assert regions is not None
+    labels = torch.stack([regions.labels.roll(index, 1) for index in range(images)])
+    field = GaussianField(means, cholesky, colors, lookup_regions(means, labels), size=(height, width))
     return Scene(field, RegionMap.from_labels(labels))

@@ -28,9 +28,10 @@ from benchmarks.core.compare import (
     means_table,
 )
 from benchmarks.core.fits import QUICK_ITERATIONS, plan
+from benchmarks.core.goals import Goal, goals_table, missed_goals
 from benchmarks.core.images import load, load_mapped, names
 from benchmarks.core.run import Job, Options, Page, Row, read_rows, run_experiment, write_rows
-from benchmarks.core.scenes import scene_of, size_of
+from benchmarks.core.scenes import fits_in, scene_of, size_of
 from benchmarks.labels import CODECS, region_numbers
 from benchmarks.pairs import read_answers
 from benchmarks.rate import bd_rate
@@ -251,3 +252,31 @@ def test_scenes() -> None:
     fitted = scene_of("rocket-1000")
     assert size_of(fitted, "native") == fitted.size and size_of(fitted, "3840 wide")[1] == 3840
     assert json.dumps(size_of(fitted, "native"))
+    images = scene_of("batch")
+    assert images.field.means.shape == (64, 256, 2) and images.render().shape == (64, 3, 128, 128)
+    assert images.regions is not None and images.regions.labels.shape == (64, 128, 128)
+    assert scene_of("batch none").regions is None
+
+
+def test_fits_of_the_data(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "scenes").mkdir()
+    scene = scene_of("W3 soft")
+    scene.save(tmp_path / "scenes/dog-7500.safetensors")
+    assert fits_in(tmp_path) == ["dog-7500"]
+    assert "without dog-1250, kodim05-10000: DATA/scenes/NAME.safetensors is missing" in capsys.readouterr().err
+    assert torch.equal(scene_of("dog-7500 soft", str(tmp_path)).render(), scene.render())
+
+
+def test_goals() -> None:
+    goals = [
+        Goal("W4", "both_ms", 2.4, 2.5),
+        Goal("W4", "peak_MB", 200.0, 150.0),
+        Goal("Kodak", "psnr", 36.5, 36.6, True),
+    ]
+    assert missed_goals(goals) == "1 of 3 goals are missed: W4, forward and backward, ms."
+    assert goals_table(goals).splitlines()[2:] == [
+        "| W4 | forward and backward, ms | <= 2.4 | 2.5 | missed |",
+        "| W4 | peak MB | <= 200 | 150 | reached |",
+        "| Kodak | PSNR | >= 36.50 | 36.60 | reached |",
+    ]
+    assert missed_goals(goals[1:]) == ""

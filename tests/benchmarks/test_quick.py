@@ -5,25 +5,25 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from importlib import import_module
 from pathlib import Path
 
 import pytest
 import torch
 
 import kcgs
-from benchmarks.__main__ import EXPERIMENTS, main
-from benchmarks.core.run import Options, read_rows
+from benchmarks.__main__ import EXPERIMENTS, main, module_of
+from benchmarks.core.run import Options, read_rows, write_rows
 from benchmarks.results import page
 from kcgs.data import save_labels
 
+OF_A_GPU = ("gpu", "gpu-fit")
 REPORTS = Path(kcgs.__file__).resolve().parent.parent / "benchmarks/reports"
 
 
 @pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # of pycocotools
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_quick_form(name: str, tmp_path: Path) -> None:
-    if name == "gpu" and not torch.cuda.is_available():
+    if name in OF_A_GPU and not torch.cuda.is_available():
         pytest.skip("needs a CUDA device")
     main([name, "-o", str(tmp_path), "--quick"])
     rows = read_rows(tmp_path / "results.csv")
@@ -48,10 +48,25 @@ def test_images_in_folders(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
-def test_no_gpu(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("name", OF_A_GPU)
+def test_no_gpu(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        main(["gpu", "-o", str(tmp_path)])
-    assert "benchmark gpu needs a CUDA device" in capsys.readouterr().err
+        main([name, "-o", str(tmp_path), "--quick"])
+    assert "a benchmark of a GPU needs a CUDA device" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", OF_A_GPU)
+def test_a_cpu_in_place_of_a_gpu(name: str, tmp_path: Path) -> None:
+    """All but captures and counts of kernels, which need CUDA."""
+    module, rows = module_of(name), []
+    for job in module.jobs(Options(tmp_path, quick=True)):
+        if job.get("task") not in ("captured", "kernels"):
+            arguments = {**job, "device": "cpu", **({"method": "cpu"} if name == "gpu" else {})}
+            rows += [{**row, "method": job["method"]} for row in module.measure(**arguments)]
+    write_rows(tmp_path / "results.csv", rows)
+    page = module.page(tmp_path, read_rows(tmp_path / "results.csv"))
+    assert page.answer and page.table and "nan" not in page.answer + page.table + page.losses
+    assert (tmp_path / page.figure).stat().st_size > 2_000
 
 
 def test_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -87,6 +102,6 @@ def test_results_are_those_of_the_reports() -> None:
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_jobs_on_data(name: str, data_root: Path) -> None:
     """The long form is not run here; its jobs are known, and JSON can hold them."""
-    jobs = import_module(f"benchmarks.{name}").jobs(Options(Path("out"), data_root))
+    jobs = module_of(name).jobs(Options(Path("out"), data_root))
     assert len({json.dumps(job) for job in jobs}) == len(jobs) > 1
     assert all(isinstance(job["image"], str) for job in jobs)

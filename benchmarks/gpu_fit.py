@@ -1,0 +1,199 @@
+"""How fast does a GPU fit, and how well?"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from functools import cache
+from multiprocessing import get_context
+from pathlib import Path
+from statistics import fmean
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kcgs import FitConfig, FitResult, fit
+from kcgs.functional import ef_psnr, psnr
+
+from .core.clocks import threads
+from .core.compare import Comparison, differences, group_by, losses_table, means_table, values_of
+from .core.cuda import check_device, finish, synchronize
+from .core.figures import Panel, save_lines
+from .core.fits import QUICK_ITERATIONS
+from .core.goals import Goal, goals_table, missed_goals
+from .core.images import FRAMES, choose, load
+from .core.run import Job, Options, Page, Row
+
+GPU, CORES, OTHER = "best, GPU", "best, cores", "gaussian-image, GPU"
+FIRST = {"process": "best, GPU, new process", "machine": "best, GPU, new machine"}
+# recipe, settings that differ from it, device
+METHODS: dict[str, tuple[str, dict[str, Any], str]] = {
+    GPU: ("best", {}, "cuda"),
+    CORES: ("best", {}, "cpu"),
+    OTHER: ("gaussian-image", {"iterations": 5_000}, "cuda"),
+    **dict.fromkeys(FIRST.values(), ("best", {}, "cuda")),
+}
+KODAK_COUNT = 10_000
+DAVIS_COUNTS = (1_250, 7_500)
+# of the fits that others are compared with
+KODAK_COMPARED = ("kodim05", "kodim15", "kodim23")
+DAVIS_COMPARED = ("dog",)
+# before a clock starts: strategies act at fractions of a fit, so that a short one compiles what a long one needs
+WARM_UP_ITERATIONS = 60
+# on an H100 or H200: seconds and dB, and seconds that a first fit may take longer
+GOALS = {"Kodak": {"seconds": 0.5, "psnr": 36.5}, "DAVIS": {"seconds": 1.5}}
+GOAL_OF_A_FIRST_FIT = 15.0
+CACHES = ("NUMBA_CACHE_DIR", "TRITON_CACHE_DIR")
+COMPARISONS = (Comparison(GPU, CORES), Comparison(GPU, OTHER))
+QUANTITIES = ("images", "seconds", "next_seconds", "process_seconds", "iterations", "psnr", "ef_psnr")
+METHOD = f"""Photos of Kodak without regions, and first frames of DAVIS with the given masks. Seconds are those of the
+call of `fit`, image and mask on the device, the GPU waited for; a short fit of the same size comes before, and is not
+in them. *GPU* is a GPU, *cores* all cores beside it. `gaussian-image` has {METHODS[OTHER][1]["iterations"]:,}
+iterations, a tenth of its own. *new process* is the first fit of a process, *new machine* that with empty caches of
+compiled code; *next* is the second fit of that process, and *process seconds* begin before Python starts."""
+
+
+def set_of(image: str) -> str:
+    """Name the set of an image."""
+    return "Kodak" if image.startswith("kodim") else "DAVIS" if image in FRAMES else "others"
+
+
+def config_of(method: str, quick: bool) -> FitConfig:
+    """Return the settings of a method."""
+    recipe, settings, _ = METHODS[method]
+    return FitConfig.from_recipe(recipe, **{**settings, **({"iterations": QUICK_ITERATIONS} if quick else {})})
+
+
+@cache
+def warm_up(config: FitConfig, n: int, size: tuple[int, int], has_labels: bool, device: str) -> None:
+    """Fit noise of this size, so that everything is compiled."""
+    noise = torch.rand(3, *size, generator=torch.Generator().manual_seed(0)).to(device)
+    labels = (noise[0].cumsum(1) > size[1] / 4).long() if has_labels else None
+    short = config.model_copy(update={"iterations": min(WARM_UP_ITERATIONS, config.usual_iterations)})
+    finish(lambda: fit(noise, labels, n, recipe=short))
+
+
+def timed_fit(image: Tensor, labels: Tensor | None, n: int, config: FitConfig) -> tuple[FitResult, float]:
+    """Fit, and return the seconds, too."""
+    synchronize()
+    start = time.perf_counter()
+    result = fit(image, labels, n, recipe=config)
+    synchronize()
+    return result, time.perf_counter() - start
+
+
+def load_to(device: str, image: str, data: str, quick: bool) -> tuple[Tensor, Tensor | None]:
+    """Read an image and its labels to a device."""
+    pixels, labels = load(image, data, quick)
+    return pixels.to(device), None if labels is None else labels.to(device)
+
+
+def fit_in_process(image: str, n: int, method: str, device: str, data: str, quick: bool) -> float:
+    """Fit, and return the seconds alone, which another process can read."""
+    return timed_fit(*load_to(device, image, data, quick), n, config_of(method, quick))[1]
+
+
+@contextmanager
+def caches_in(folder: str) -> Iterator[None]:
+    """Let processes that are started keep compiled code in a folder."""
+    before = {name: os.environ.pop(name, None) for name in CACHES}
+    os.environ.update(dict.fromkeys(CACHES, folder))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name)
+            if value is not None:
+                os.environ[name] = value
+
+
+def measure_first_fit(*arguments: Any, new_machine: bool) -> Row:
+    """Fit twice in a process of its own."""
+    with TemporaryDirectory() as folder, caches_in(folder) if new_machine else nullcontext():
+        start = time.perf_counter()
+        with get_context("spawn").Pool(1) as pool:
+            first = pool.apply(fit_in_process, arguments)
+            whole = time.perf_counter() - start
+            return {"seconds": first, "next_seconds": pool.apply(fit_in_process, arguments), "process_seconds": whole}
+
+
+def measure(image: str, n: int, method: str, device: str, data: str, quick: bool) -> list[Row]:
+    """Fit an image by one of METHODS."""
+    check_device(device)
+    row = {"image": image, "n": n, "method": method}
+    if method in FIRST.values():
+        new_machine = method == FIRST["machine"]
+        return [row | measure_first_fit(image, n, method, device, data, quick, new_machine=new_machine)]
+    pixels, labels = load_to(device, image, data, quick)
+    config = config_of(method, quick)
+    with threads(os.cpu_count() or 1):
+        warm_up(config, n, (pixels.shape[1], pixels.shape[2]), labels is not None, device)
+        result, seconds = timed_fit(pixels, labels, n, config)
+    render = result.scene.render()
+    row |= {"seconds": seconds, "iterations": result.history[-1].iteration, "psnr": float(psnr(render, pixels))}
+    return [row | ({} if labels is None else {"ef_psnr": float(ef_psnr(render, pixels, labels))})]
+
+
+def jobs(options: Options) -> list[Job]:
+    """Fit photos of Kodak and frames of DAVIS; without data, photos of scikit-image."""
+    plan = [(image, KODAK_COUNT, GPU) for image in choose(options, "kodak")]
+    if options.quick:
+        plan = [("disc", 30, method) for method in (GPU, CORES, OTHER, FIRST["process"])]
+    elif options.data is not None:
+        frames = choose(options, "davis")
+        plan += [(image, n, GPU) for image in frames for n in DAVIS_COUNTS]
+        plan += [(KODAK_COMPARED[0], KODAK_COUNT, method) for method in FIRST.values()]
+        plan += [(image, KODAK_COUNT, method) for image in KODAK_COMPARED for method in (CORES, OTHER)]
+        plan += [(image, n, CORES) for image in DAVIS_COMPARED for n in DAVIS_COUNTS]
+    return [
+        {"image": image, "n": n, "method": method, "device": METHODS[method][2], **options.image_arguments()}
+        for image, n, method in plan
+    ]
+
+
+def page(folder: Path, rows: list[Row]) -> Page:
+    """Write the report."""
+    rows = [{**row, "set": set_of(row["image"])} for row in rows]
+    groups = group_by(rows, ["set", "n", "method"])
+    rows = [{**row, "images": len(group)} for group in groups.values() for row in group]
+    fits = [row for row in rows if row["method"] not in FIRST.values()]
+    panels = [Panel(str(name), group, "seconds", "psnr") for (name,), group in group_by(fits, ["set"]).items()]
+    save_lines(folder / "gpu-fit.png", panels, "method", "n")
+    means = {
+        (str(name), n): {quantity: fmean(values_of(group, quantity)) for quantity in ("seconds", "psnr")}
+        for (name, n, method), group in groups.items()
+        if method == GPU
+    }
+    longer = {
+        kind: fmean(row["seconds"] - row["next_seconds"] for row in first)
+        for kind, method in FIRST.items()
+        if (first := [row for row in rows if row["method"] == method])
+    }
+    goals = [
+        Goal(f"{name}, N = {n:,}", quantity, limit, mean[quantity], quantity == "psnr")
+        for (name, n), mean in means.items()
+        for quantity, limit in GOALS.get(name, {}).items()
+    ]
+    if "machine" in longer:
+        goals.append(Goal("first fit of a machine", "seconds longer", GOAL_OF_A_FIRST_FIT, longer["machine"]))
+    sentences = [
+        *(
+            f"On the GPU `best` takes {m['seconds']:.2g} s for {m['psnr']:.2f} dB ({s}, N = {n:,})."
+            for (s, n), m in means.items()
+        ),
+        *(f"The first fit of a {kind} takes {seconds:.2g} s longer than the next." for kind, seconds in longer.items()),
+    ]
+    tables = [
+        means_table(rows, ["set", "n", "method"], "", QUANTITIES),
+        *(["Goals:", goals_table(goals)] if goals else []),
+    ]
+    losses = [missed_goals(goals), losses_table(fits, COMPARISONS, ["psnr", "seconds"], ["n"])]
+    gains = differences(fits, COMPARISONS, ["psnr", "seconds"], ["set", "n"])
+    return Page(
+        "How fast does a GPU fit, and how well?", " ".join(sentences), "gpu-fit.png", "\n\n".join(tables),
+        "\n\n".join(filter(None, losses)), METHOD, gains,
+    )  # fmt: skip
