@@ -6,6 +6,7 @@ import functools
 from importlib import import_module
 
 import torch
+from torch import Tensor
 
 from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument
@@ -28,14 +29,20 @@ def resolve(backend: str, inputs: SplatInputs) -> Steps:
 
 def prepare(backend: str, device: torch.device, dtype: torch.dtype, channels: int) -> None:
     """Render and differentiate once, before a clock starts, since much is compiled or loaded at first use."""
+    image = _try(backend, device, dtype, channels)
+    leaf = image.detach().requires_grad_()
+    torch.autograd.grad(leaf.sum(), leaf)  # torch, too, loads much at its first gradient
+
+
+def _try(backend: str, device: torch.device, dtype: torch.dtype, channels: int) -> Tensor:
+    """Render and differentiate one Gaussian."""
     means, cholesky, colors = (torch.full((1, 1, n), 8.0, device=device, dtype=dtype) for n in (2, 3, channels))
     inputs = SplatInputs(means, cholesky, colors, None, None, (16, 16), 1e-4)
     steps = resolve(backend, inputs)
     plan = steps.plan(inputs)
     image = steps.render(plan, inputs)
     steps.differentiate(plan, inputs, torch.ones_like(image), True)
-    leaf = image.detach().requires_grad_()
-    torch.autograd.grad(leaf.sum(), leaf)  # torch, too, loads much at its first gradient
+    return image
 
 
 def _choose(backend: str, device: torch.device, dtype: torch.dtype) -> str:
@@ -50,7 +57,7 @@ def _choose(backend: str, device: torch.device, dtype: torch.dtype) -> str:
 def _compiles(device: torch.device) -> bool:
     """Try the kernel `cuda` on a device, and warn, once, where it cannot be compiled."""
     try:
-        prepare("cuda", device, torch.float32, 3)
+        _try("cuda", device, torch.float32, 3)
     except Exception as error:  # whatever a compiler, a driver or a card lacks
         warn_user(f"backend 'auto' takes 'tiled' on {device}, which is slower: {type(error).__name__}: {error}")
         return False

@@ -15,13 +15,13 @@ from kcgs import GaussianField, RegionMap, RegionSplatRenderer
 from kcgs.functional import region_splat
 from kcgs.functional.operator import splat_operator
 from kcgs.kernels import Membership, SplatInputs, cuda, reference, settle, without_waiting
-from kcgs.kernels.cuda import capacity, gather, plan, render
+from kcgs.kernels.cuda import capacity, gather, plan, program, render
 from kcgs.optim import GaussianAdam
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 GPU = DEVICE.type == "cuda"
 needs_gpu = pytest.mark.skipif(not GPU, reason="a CUDA graph needs a GPU")
-if plan.is_interpreted():
+if program.is_interpreted():
     # it would patch the whole language anew at every call of a function; plain Python is a part of what calls it
     render.weigh = gather.weigh = render.weigh.fn
 
@@ -276,13 +276,8 @@ def test_number_of_launches(monkeypatch: pytest.MonkeyPatch) -> None:
     """A forward takes at most 6 launches and 12 operations of torch, a backward 3 and 8; launches do nothing here."""
     launches: list[str] = []
 
-    class Launch:
-        def __init__(self, name: str) -> None:
-            self.name = name
-
-        def __getitem__(self, grid: tuple[int, ...]) -> Callable[..., None]:
-            launches.append(self.name)
-            return lambda *arguments, **constants: None
+    def launch(name: str) -> Callable[..., None]:
+        return lambda *arguments, **constants: launches.append(name)
 
     def count(action: Callable[[], Any]) -> tuple[Any, int, int]:
         launches.clear()
@@ -300,7 +295,7 @@ def test_number_of_launches(monkeypatch: pytest.MonkeyPatch) -> None:
         (gather, ("_gather", "_reduce")),
     ):
         for name in names:
-            monkeypatch.setattr(module, name, Launch(name))
+            monkeypatch.setattr(module, name, launch(name))
     image, programs, operations = count(lambda: region_splat(**arguments))
     assert programs <= 6 and operations <= 12
     grad = torch.ones_like(image)

@@ -21,7 +21,8 @@ def steps(inputs: SplatInputs) -> Steps:
     if find_spec("triton") is None:
         raise ImportError("backend 'cuda' needs Triton: pip install triton")
     from .gather import differentiate, error_gradients
-    from .plan import is_interpreted, plan
+    from .plan import plan
+    from .program import is_interpreted
     from .render import render
 
     if device.type != "cuda" and not is_interpreted():

@@ -1,7 +1,7 @@
 """Gradients: sums over the pixels of each pair, then over the pairs of each Gaussian.
 
-A thread owns a pair, 32 to a program, and walks some rows of the tile; the rows of a tile are split between programs
-where tiles alone are too few for a GPU. A program owns a Gaussian, and adds its slots in order.
+A thread owns a pair and 4 rows of its tile, and walks their pixels; the threads of a pair then add up what they have. A
+program of `_reduce` owns a Gaussian, and adds its slots in order.
 """
 
 from __future__ import annotations
@@ -12,38 +12,36 @@ import triton.language as tl
 from torch import Tensor
 
 from ..interface import Gradients, SplatInputs
-from .plan import OPTIONS, PIECE, PIECES, SCALE, SIDE, Plan, fails, program
+from .plan import PIECE, PIECES, SCALE, SIDE, Plan, fails
+from .program import program
 from .render import channels_at_once, lists_of, render, weigh
 
-# tiles below which the rows of a tile are split, and into how many parts
-_FEW_TILES, _PARTS = 8192, 4
+# parts of a tile's rows, one for each thread of a pair
+_PARTS = tl.constexpr(4)
 # pixels whose loads are under way at once
 _UNROLL = tl.constexpr(4)
 # slots that a program adds at once, and columns of terms
-_SLOTS, _COLUMNS = 128, 8
-_SLOTS_WARPS = 4
+_SLOTS, _COLUMNS = 64, 8
 
 
 def differentiate(plan: Plan, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
     """Return the gradients of means, cholesky (None each without `geometry`) and colors."""
     _, cholesky, colors = (t.contiguous() for t in inputs.gaussians)
     channels, total = colors.shape[-1], colors.shape[:-1].numel()
-    parts = _PARTS if plan.grid.total < _FEW_TILES else 1
-    terms = torch.empty(parts, plan.room, channels + (5 if geometry else 0), device=colors.device)
+    terms = torch.empty(plan.room, channels + (5 if geometry else 0), device=colors.device)
     leaves = inputs.gaussians if geometry else inputs.gaussians[2:]
     grads = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in leaves]
     means_grad, cholesky_grad = grads[:2] if geometry else (None, None)
-    lists, mapped, num_pieces = lists_of(plan, inputs), inputs.coverage is not None, plan.pieces.shape[1]
+    num_pieces = plan.pieces.shape[1]
     with torch.cuda.device_of(terms):
-        _gather[(num_pieces, parts)](
-            terms, terms.stride(2), grad, *(0, *grad.stride())[-4:], colors, colors.stride(-1), plan.pieces,
-            num_pieces, *lists, *inputs.size, channels,
-            BLOCK=channels_at_once(channels), MAPPED=mapped, GEOMETRY=geometry, PARTS=parts, num_warps=1, **OPTIONS,
+        _gather(
+            (num_pieces,), terms, grad.contiguous(), colors, terms.stride(1), plan.pieces, num_pieces,
+            *lists_of(plan, inputs), *inputs.size, channels,
+            BLOCK=channels_at_once(channels), MAPPED=inputs.coverage is not None, GEOMETRY=geometry,
         )  # fmt: skip
-        _reduce[(total,)](
-            terms, cholesky, plan.counters, plan.gaussians, plan.slots, means_grad, cholesky_grad, grads[-1],
-            total, plan.room, channels,
-            GEOMETRY=geometry, PARTS=parts, BLOCK=_SLOTS, COLUMNS=_COLUMNS, num_warps=_SLOTS_WARPS, **OPTIONS,
+        _reduce(
+            (total,), terms, cholesky, plan.counters, plan.gaussians, plan.slots, means_grad, cholesky_grad, grads[-1],
+            total, plan.room, channels, GEOMETRY=geometry, BLOCK=_SLOTS, COLUMNS=_COLUMNS,
         )  # fmt: skip
     return means_grad, cholesky_grad, grads[-1]
 
@@ -53,80 +51,84 @@ def error_gradients(plan: Plan, inputs: SplatInputs, target: Tensor) -> Gradient
     return differentiate(plan, inputs, render(plan, inputs, target), True)
 
 
-@program(
-    "term_stride image_stride channel_stride row_stride column_stride color_stride num_pieces "
-    "room num_cells num_tiles rows cols height width channels"
-)
+@program(warps=1)
 def _gather(  # type: ignore[no-untyped-def]
-    terms, term_stride, grad, image_stride, channel_stride, row_stride, column_stride, colors, color_stride, pieces,
-    num_pieces,
+    terms, grad, colors, channel_step, pieces, num_pieces,
     counters, lists, slots, coefficients, weights,
     room, num_cells, num_tiles, rows, cols, cutoff, height, width, channels,
-    BLOCK: tl.constexpr, MAPPED: tl.constexpr, GEOMETRY: tl.constexpr, PARTS: tl.constexpr,
+    BLOCK: tl.constexpr, MAPPED: tl.constexpr, GEOMETRY: tl.constexpr,
 ):  # fmt: skip
-    """Sum, over some rows of a tile, w g and v (z1, z2, z1 z1, z1 z2, z2 z2), see whitened.sums_to_gradients."""
-    piece, part = tl.program_id(0), tl.program_id(1)
+    """Sum w g and v (z1, z2, z1 z1, z1 z2, z2 z2) over the pixels of a tile, see whitened.sums_to_gradients."""
+    piece = tl.program_id(0)
     if piece >= tl.load(counters + PIECES):
         return
     tile = tl.load(pieces + piece)
     end = tl.load(lists + num_cells + tile) + tl.load(lists + 2 * num_cells + num_tiles + tile)
-    pair = tl.load(pieces + num_pieces + piece) + tl.arange(0, PIECE)
+    thread = tl.arange(0, PIECE * _PARTS)
+    first = tl.load(pieces + num_pieces + piece)
+    pair = first + thread % PIECE
     valid = pair < end
     k = coefficients + pair.to(tl.int64) * 5
     k0, k1 = tl.load(k, mask=valid, other=0.0), tl.load(k + 1, mask=valid, other=0.0)
     k2, k3 = tl.load(k + 2, mask=valid, other=0.0), tl.load(k + 3, mask=valid, other=0.0)
     k4 = tl.load(k + 4, mask=valid, other=0.0)
     gaussian = tl.load(slots + room + pair, mask=valid, other=0).to(tl.int64)
+    top, left, image = tile // cols % rows * SIDE, tile % cols * SIDE, (tile // (rows * cols)).to(tl.int64)
+    first_row = thread // PIECE * (SIDE // _PARTS)
     if MAPPED:
         plane = tl.load(slots + 2 * room + pair, mask=valid, other=-1)
-        is_shared = plane >= 0
-        membership = weights + plane * (SIDE * SIDE)
-    top, left, image = tile // cols % rows * SIDE, tile % cols * SIDE, (tile // (rows * cols)).to(tl.int64)
-    corner = grad + image * image_stride + top * row_stride + left * column_stride
-    first_row, last_row = part * (SIDE // PARTS), tl.minimum((part + 1) * (SIDE // PARTS), height - top)
-    last_column = tl.minimum(SIDE, width - left)
-    target = terms + (part.to(tl.int64) * room + pair) * (channels + (5 if GEOMETRY else 0))
-    zero = tl.zeros([PIECE], tl.float32)
-    s1, s2, s11, s12, s22 = zero, zero, zero, zero, zero
+        membership = weights + plane * (SIDE * SIDE) + first_row * SIDE
+    s1 = tl.zeros([PIECE * _PARTS], tl.float32)
+    s2, s11, s12, s22 = s1, s1, s1, s1
     for base in range(0, channels, BLOCK):
         channel = base + tl.arange(0, BLOCK)[:, None]
         in_range = channel < channels
-        # steps of channels that the compiler does not know: it would spread a pair's channels over threads
-        address = colors + gaussian[None, :] * channels + channel * color_stride
-        color = tl.load(address, mask=in_range & valid[None, :], other=0.0)
-        sums = tl.zeros([BLOCK, PIECE], tl.float32)
-        for row in range(first_row, last_row):
-            pixel = corner + row * row_stride + channel * channel_stride
-            for column in tl.range(last_column, loop_unroll_factor=_UNROLL):
-                z1, z2, weight = weigh(k0, k1, k2, k3, k4, column - (SIDE - 1) / 2, row - (SIDE - 1) / 2, cutoff)
+        # a step between channels that the compiler does not know: else it would spread them over threads
+        color = colors + gaussian[None, :] * channels + channel * channel_step
+        color = tl.load(color, mask=in_range & valid[None, :], other=0.0)
+        sums = tl.zeros([BLOCK, PIECE * _PARTS], tl.float32)
+        corner = grad + ((image * channels + channel) * height + top + first_row[None, :]) * width + left
+        for row in range(SIDE // _PARTS):
+            y = (first_row + row) - (SIDE - 1) / 2
+            in_row = in_range & (top + first_row + row < height)[None, :]
+            for column in tl.range(tl.minimum(SIDE, width - left), loop_unroll_factor=_UNROLL):
+                z1, z2, weight = weigh(k0, k1, k2, k3, k4, column - (SIDE - 1) / 2, y, cutoff)
                 if MAPPED:
-                    weight *= tl.load(membership + row * SIDE + column, mask=is_shared, other=1.0)
-                local = tl.load(pixel, mask=in_range, other=0.0)
-                pixel += column_stride
+                    weight *= tl.load(membership + row * SIDE + column, mask=plane >= 0, other=1.0)
+                local = tl.load(corner + row * width + column, mask=in_row, other=0.0)
                 sums += local * weight[None, :]
                 if GEOMETRY:
-                    first = tl.sum(local * color, axis=0) * weight
-                    second = first * z2
-                    first *= z1
-                    s1 += first
-                    s2 += second
-                    s11 += first * z1
-                    s12 += first * z2
-                    s22 += second * z2
-        address = target[None, :] + ((5 if GEOMETRY else 0) + channel) * term_stride
-        tl.store(address, sums, mask=in_range & valid[None, :])
+                    first_moment = tl.sum(local * color, axis=0) * weight
+                    second_moment = first_moment * z2
+                    first_moment *= z1
+                    s1 += first_moment
+                    s2 += second_moment
+                    s11 += first_moment * z1
+                    s12 += first_moment * z2
+                    s22 += second_moment * z2
+        place = (first + tl.arange(0, PIECE)).to(tl.int64)[None, :] * (channels + (5 if GEOMETRY else 0)) + channel
+        sums = tl.sum(tl.reshape(sums, [BLOCK, _PARTS, PIECE]), axis=1)
+        kept = in_range & (first + tl.arange(0, PIECE) < end)[None, :]
+        tl.store(terms + place + (5 if GEOMETRY else 0), sums, mask=kept)
     if GEOMETRY:
-        tl.store(target, s1, mask=valid)
-        tl.store(target + 1, s2, mask=valid)
-        tl.store(target + 2, s11, mask=valid)
-        tl.store(target + 3, s12, mask=valid)
-        tl.store(target + 4, s22, mask=valid)
+        _store(terms, s1, first, end, channels + 5)
+        _store(terms + 1, s2, first, end, channels + 5)
+        _store(terms + 2, s11, first, end, channels + 5)
+        _store(terms + 3, s12, first, end, channels + 5)
+        _store(terms + 4, s22, first, end, channels + 5)
 
 
-@program("total room channels")
+@triton.jit
+def _store(address, sums, first, end, columns):  # type: ignore[no-untyped-def]
+    """Add up the parts of each pair."""
+    pair = first + tl.arange(0, PIECE)
+    tl.store(address + pair.to(tl.int64) * columns, tl.sum(tl.reshape(sums, [_PARTS, PIECE]), axis=0), mask=pair < end)
+
+
+@program(warps=2)
 def _reduce(  # type: ignore[no-untyped-def]
     terms, cholesky, counters, gaussians, slots, means_grad, cholesky_grad, colors_grad, total, room, channels,
-    GEOMETRY: tl.constexpr, PARTS: tl.constexpr, BLOCK: tl.constexpr, COLUMNS: tl.constexpr,
+    GEOMETRY: tl.constexpr, BLOCK: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
     """Add the terms of a Gaussian in the order of its slots, and turn them into gradients."""
     g = tl.program_id(0)
@@ -142,11 +144,10 @@ def _reduce(  # type: ignore[no-untyped-def]
         sums = tl.zeros([COLUMNS], tl.float64)
         for k in range(0, count, BLOCK):
             slot = k + tl.arange(0, BLOCK)
-            pair = tl.load(slots + 3 * room + begin + slot, mask=slot < count, other=-1)
+            pair = tl.load(slots + 3 * room + begin + slot, mask=slot < count, other=-1).to(tl.int64)
             kept = (pair >= 0)[:, None] & (base + column < columns)[None, :]
-            for part in range(PARTS):
-                place = (part * room.to(tl.int64) + pair)[:, None] * columns + base + column[None, :]
-                sums += tl.sum(tl.load(terms + place, mask=kept, other=0.0).to(tl.float64), axis=0)
+            place = pair[:, None] * columns + base + column[None, :]
+            sums += tl.sum(tl.load(terms + place, mask=kept, other=0.0).to(tl.float64), axis=0)
         sums = tl.where(failed, float("nan"), sums)
         if GEOMETRY and base == 0:
             s1, s2 = _at(sums, column, 0) / SCALE, _at(sums, column, 1) / SCALE

@@ -8,8 +8,7 @@ pair. Every list is in the order of the Gaussians.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 import triton
@@ -20,17 +19,14 @@ from ..interface import SplatInputs
 from ..tiles import MARGIN, RELATIVE_MARGIN, TILE, TileGrid, grid_of
 from ..whitened import MEAN_LIMIT, SCALE_LIMITS, Z_LIMIT, support_radius
 from .capacity import notes_of, remember, report, reports, reserve, room_for
+from .program import program
 
-# Gaussians of a program of `_prepare`, and of a step of the others; threads of these are 32 times as many
-_PREPARE_BLOCK = 128
-_BIN_BLOCK, _BIN_WARPS = 1024, 8
-_TILE_BLOCK, _TILE_WARPS = 128, 4
-# multiply and add in one: Triton 3.9 warns where it is not set, and 3.10 will leave it out
-OPTIONS = {"enable_fp_fusion": True}
+# Gaussians of a program of `_prepare`, and of a step of the others
+_PREPARE_BLOCK, _BIN_BLOCK, _TILE_BLOCK = 128, 1024, 128
 
 # what programs read as constants
 SIDE = tl.constexpr(TILE)
-PIECE = tl.constexpr(32)  # pairs of a program of the backward, one for each thread of a warp
+PIECE = tl.constexpr(8)  # pairs of a program of the backward
 SCALE = tl.constexpr(math.sqrt(0.5 / math.log(2.0)))  # whitened coordinates times this, squared, are an exponent of 2
 _CELL = tl.constexpr(8)  # tiles along a side of a cell
 _REACH = tl.constexpr(1 + RELATIVE_MARGIN)
@@ -58,7 +54,7 @@ class Plan(NamedTuple):
     lists: Tensor  # [2, cells + tiles] int32: place of the first entry or pair, and how many
     slots: Tensor  # [4, S] int32: entries of cells; Gaussians of pairs, and their planes; pairs of slots, -1: none
     coefficients: Tensor  # [S, 5] float32, of pairs: see tiles.coefficients, times SCALE
-    pieces: Tensor  # [2, P] int32: a tile, and the first of up to 32 of its pairs
+    pieces: Tensor  # [2, P] int32: a tile, and the first of up to 8 of its pairs
     grid: TileGrid
     num_cells: int
     foreign: int  # Gaussians whose region id the map does not hold, where the plan waited for the device
@@ -86,10 +82,11 @@ def plan(inputs: SplatInputs) -> Plan | None:
         num_ids, map_tiles = len(ids), len(coverage.starts) - 1
         starts, regions, planes, _ = coverage
     with torch.cuda.device_of(means):
-        _prepare[(-(-total // _PREPARE_BLOCK),)](
+        _prepare(
+            (-(-total // _PREPARE_BLOCK),),
             means, cholesky, colors, inputs.region_index, ids, counters, gaussians, notes, total, num_ids,
             num_ids.bit_length(), height, width, channels, radius, MAPPED=num_ids > 0,
-            NOTES=waits and reports(), BLOCK=_PREPARE_BLOCK, **OPTIONS,
+            NOTES=waits and reports(), BLOCK=_PREPARE_BLOCK,
         )  # fmt: skip
         if room is None:
             room, invalid, foreign, _, _, _, *noted = counters.tolist()
@@ -102,29 +99,21 @@ def plan(inputs: SplatInputs) -> Plan | None:
             slots = torch.empty(4, room, dtype=torch.int32, device=device)
             coefficients = torch.empty(room, 5, device=device)
             pieces = torch.empty(2, room // PIECE.value + grid.total, dtype=torch.int32, device=device)
-        _bin[(num_cells,)](
+        _bin(
+            (num_cells,),
             gaussians, counters, lists, slots, notes, total, count, room, num_cells + grid.total, cell_rows, cell_cols,
-            NOTES=not waits, BLOCK=_BIN_BLOCK, num_warps=_BIN_WARPS, **OPTIONS,
+            NOTES=not waits, BLOCK=_BIN_BLOCK,
         )  # fmt: skip
-        _tile[(grid.total,)](
+        _tile(
+            (grid.total,),
             means, cholesky, counters, gaussians, lists, slots, coefficients, pieces, starts, regions, planes,
             map_tiles, total, room, num_cells, grid.total, grid.rows, grid.cols, cell_rows, cell_cols, pieces.shape[1],
-            radius, MAPPED=num_ids > 0, BLOCK=_TILE_BLOCK, num_warps=_TILE_WARPS, **OPTIONS,
+            radius, MAPPED=num_ids > 0, BLOCK=_TILE_BLOCK,
         )  # fmt: skip
     return Plan(counters, gaussians, lists, slots, coefficients, pieces, grid, num_cells, foreign)
 
 
-def program(integers: str) -> Callable[[Any], Any]:
-    """Decorate a program to be compiled once for all values of its integers."""
-    return lambda function: triton.jit(function, do_not_specialize=integers.split())
-
-
-def is_interpreted() -> bool:
-    """Whether TRITON_INTERPRET=1 was set when triton was imported: programs run in numpy, on CPU tensors."""
-    return not isinstance(_prepare, triton.JITFunction)
-
-
-@program("total num_ids steps height width channels")
+@program(warps=4)
 def _prepare(  # type: ignore[no-untyped-def]
     means, cholesky, colors, region_ids, ids, counters, gaussians, notes,
     total, num_ids, steps, height, width, channels, radius,
@@ -199,7 +188,7 @@ def _box(gaussians, g, total, mask):  # type: ignore[no-untyped-def]
     return first & 0xFFFF, first >> 16, last & 0xFFFF, last >> 16
 
 
-@program("total count room num_lists cell_rows cell_cols")
+@program(warps=8)
 def _bin(  # type: ignore[no-untyped-def]
     gaussians, counters, lists, slots, notes, total, count, room, num_lists, cell_rows, cell_cols,
     NOTES: tl.constexpr, BLOCK: tl.constexpr,
@@ -241,7 +230,7 @@ def _overlaps(x0, y0, x1, y1, left, top):  # type: ignore[no-untyped-def]
     return touches & (y0 <= y1)
 
 
-@program("map_tiles total room num_cells num_tiles rows cols cell_rows cell_cols num_pieces")
+@program(warps=4)
 def _tile(  # type: ignore[no-untyped-def]
     means, cholesky, counters, gaussians, lists, slots, coefficients, pieces, starts, regions, planes,
     map_tiles, total, room, num_cells, num_tiles, rows, cols, cell_rows, cell_cols, num_pieces, radius,

@@ -12,11 +12,11 @@ from torch import Tensor
 
 from ..interface import SplatInputs
 from ..whitened import least_exponent
-from .plan import OPTIONS, SIDE, Plan, fails, program
+from .plan import SIDE, Plan, fails
+from .program import program
 
 # channels that a thread holds at once, in registers
 _MAX_CHANNELS = 8
-_WARPS = 2
 # pairs whose loads are under way at once
 _UNROLL = tl.constexpr(4)
 # a smaller weight is 0
@@ -29,9 +29,10 @@ def render(plan: Plan, inputs: SplatInputs, target: Tensor | None = None) -> Ten
     image = torch.empty(*inputs.colors.shape[:-2], channels, height, width, device=inputs.colors.device)
     block = channels_at_once(channels)
     with torch.cuda.device_of(image):
-        _render[(grid.total, triton.cdiv(channels, block))](
+        _render(
+            (grid.total, triton.cdiv(channels, block)),
             image, None if target is None else target.contiguous(), inputs.colors.contiguous(), *lists_of(plan, inputs),
-            height, width, channels, BLOCK=block, MAPPED=inputs.coverage is not None, num_warps=_WARPS, **OPTIONS,
+            height, width, channels, BLOCK=block, MAPPED=inputs.coverage is not None,
         )  # fmt: skip
     return image
 
@@ -57,7 +58,7 @@ def weigh(k0, k1, k2, k3, k4, x, y, cutoff):  # type: ignore[no-untyped-def]
     return z1, z2, tl.where(weight >= cutoff, weight, 0.0)
 
 
-@program("room num_cells num_tiles rows cols height width channels")
+@program(warps=2)
 def _render(  # type: ignore[no-untyped-def]
     image, target, colors, counters, lists, slots, coefficients, weights,
     room, num_cells, num_tiles, rows, cols, cutoff, height, width, channels,
