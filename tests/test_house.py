@@ -30,6 +30,7 @@ LAYERS = [
     {"nn"},
     {"functional"},
     {"kernels", "engine", "plots"},
+    {"maps"},
     {"_image", "_labels"},
     {"_check", "_decode", "_memory", "_atomic", "_progress", "_repr", "_suffixes", "_warn"},
     {"errors", "_rows"},

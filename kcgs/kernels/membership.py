@@ -14,16 +14,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcgs.maps.coverage import Coverage
+from kcgs.maps import RADIUS_SIGMAS
 
 from .antialiasing import SmoothLabels
 
 T = TypeVar("T")
 
-TILE = 16
-
-# reach of a contour, in widths: the blur's kernel is cut there
-RADIUS_SIGMAS = 4.0
 # windows of a task
 _TASK_WINDOWS = 32
 

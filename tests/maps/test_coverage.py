@@ -1,0 +1,107 @@
+"""Coverage against the definition of membership: regions of tiles, and weights of their pixels."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from kcgs.kernels import Membership
+from kcgs.maps import Coverage, make_coverage
+
+TILE = 16
+Widths = float | dict[tuple[int, int], float]
+
+
+def random_labels(*shape: int, regions: int, grain: int = 1, seed: int = 0) -> Tensor:
+    """Blocks of `grain` pixels with random labels, of which all occur if there is room."""
+    generator = torch.Generator().manual_seed(seed)
+    maps, *sides = shape
+    blocks = [-(-side // grain) for side in sides]
+    labels = torch.randperm(maps * math.prod(blocks), generator=generator).view(maps, *blocks) % regions
+    return labels.repeat_interleave(grain, 1).repeat_interleave(grain, 2)[:, : sides[0], : sides[1]]
+
+
+def cake(slices: int, size: int = 40) -> Tensor:
+    """Regions that all meet in one pixel."""
+    y, x = torch.meshgrid(torch.arange(size) - 24.5, torch.arange(size) - 23.5, indexing="ij")
+    return ((torch.atan2(y, x) / (2 * math.pi) + 0.5) * slices).long().clamp_max(slices - 1)[None]
+
+
+def pairs(regions: int, widths: list[float]) -> dict[tuple[int, int], float]:
+    return dict(zip(itertools.combinations(range(regions), 2), itertools.cycle(widths), strict=False))
+
+
+MAPS: dict[str, Tensor] = {
+    "one pixel": torch.zeros(1, 1, 1).long(),
+    "one row": torch.arange(50).view(1, 1, 50) // 7,
+    "one region": torch.zeros(2, 20, 40).long(),
+    "eight in a tile": cake(8),
+    "batch": random_labels(3, 35, 50, regions=4, grain=9),
+    "pixels": random_labels(1, 20, 33, regions=40),
+    "thousands": random_labels(1, 60, 51, regions=3000),
+}
+
+
+def membership_of(labels: Tensor, softness: Widths) -> Membership:
+    return Membership(labels.int(), int(labels.max()) + 1, softness)
+
+
+def coverage_of(membership: Membership) -> Coverage:
+    return make_coverage(membership.index, membership.num_regions, *membership.levels)
+
+
+def tile_slices(shape: torch.Size) -> list[tuple[int, slice, slice]]:
+    maps, height, width = shape
+    corners = itertools.product(range(maps), range(0, height, TILE), range(0, width, TILE))
+    return [(b, slice(y, min(y + TILE, height)), slice(x, min(x + TILE, width))) for b, y, x in corners]
+
+
+def check(coverage: Coverage, membership: Membership) -> None:
+    """Compare with regions that are looked for pixel by pixel, and with dense weights."""
+    index, (widths, level) = membership.index, membership.levels
+    oracle = {
+        (b, r): membership.weights(b, r, torch.float64)
+        for b, r in itertools.product(range(len(index)), range(membership.num_regions))
+    }
+    tiles = tile_slices(index.shape)
+    assert [part.dtype for part in coverage] == [torch.int32] * 3 + [torch.float32]
+    starts, planes = coverage.starts.tolist(), coverage.planes.tolist()
+    assert starts[0] == 0 and len(starts) == len(tiles) + 1 and starts[-1] == len(coverage.regions)
+    shared = [plane for plane in planes if plane >= 0]
+    assert shared == list(range(len(coverage.weights)))
+    for (b, rows, cols), first, end in zip(tiles, starts[:-1], starts[1:], strict=True):
+        reach = math.ceil(4 * widths[0 if level is None else int(level[b, rows, cols].max())])
+        around = (slice(max(s.start - reach, 0), s.start + TILE + reach) for s in (rows, cols))
+        regions = index[b][tuple(around)].unique().tolist()
+        assert coverage.regions[first:end].tolist() == regions
+        for region, plane in zip(regions, planes[first:end], strict=True):
+            assert (plane < 0) == (len(regions) == 1)
+            weights = torch.ones(TILE, TILE) if plane < 0 else coverage.weights[plane].view(TILE, TILE)
+            expected = oracle[b, region][rows, cols]
+            assert (weights[: expected.shape[0], : expected.shape[1]] - expected).abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("softness", [0.0, 0.7, 3.0])
+@pytest.mark.parametrize("name", MAPS)
+def test_one_width(name: str, softness: float) -> None:
+    membership = membership_of(MAPS[name], softness)
+    check(coverage_of(membership), membership)
+
+
+@pytest.mark.parametrize("name", ["one row", "eight in a tile", "batch", "pixels"])
+def test_widths_of_pairs(name: str) -> None:
+    softness = pairs(int(MAPS[name].max()) + 1, [0.7, 0.0, 2.2, 1.1])
+    membership = membership_of(MAPS[name], softness)
+    assert membership.levels.level is not None
+    check(coverage_of(membership), membership)
+
+
+@pytest.mark.parametrize("softness", [64.0, pairs(5, [64.0, 0.5, 20.0])])
+def test_wide_contours(softness: Widths, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("kcgs.maps.coverage._CHUNK_BYTES", 1 << 24)  # of many parts
+    membership = membership_of(random_labels(1, 50, 70, regions=5, grain=17), softness)
+    check(coverage_of(membership), membership)
