@@ -17,7 +17,7 @@ from torch import Tensor
 
 from kcgs._check import check_floating, check_number
 from kcgs._labels import check_labels
-from kcgs.kernels.membership import RADIUS_SIGMAS
+from kcgs.maps import RADIUS_SIGMAS
 
 from .labels import contour_edges, unique_pairs
 from .softness import MAX_SOFTNESS

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from kcgs.kernels.antialiasing import antialias, shifted
-from kcgs.kernels.membership import RADIUS_SIGMAS
 from kcgs.kernels.resampled import LEAST_BLUR, sharpness
+from kcgs.maps import RADIUS_SIGMAS
 
 from .map_tables import MapOperands
 from .sizes import is_equal

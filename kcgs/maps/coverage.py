@@ -13,9 +13,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from .widths import RADIUS_SIGMAS, reach_of
+
 TILE = 16  # pixels along a side
-# reach of a contour, in widths: the blur's kernel is cut there
-RADIUS_SIGMAS = 4.0
 # bytes of windows and what is made of them at once
 _CHUNK_BYTES = 1 << 28
 # bytes per pixel of a window in a list: the label, its tests, its key
@@ -45,7 +45,7 @@ def make_coverage(
         widths: of contours in pixels, ascending; 0 is hard.
         width_index: position of each pixel's width among them, (maps, H, W) int32; None where there is one.
     """
-    windows = _Windows(index, _reach(widths[-1]))
+    windows = _Windows(index, reach_of(widths[-1]))
     tile_widths = None if width_index is None else _TileWidths(width_index)
     reaches = None if tile_widths is None else tile_widths.reaches(widths)
     keys = _list_keys(windows, num_regions, reaches).sort()[0]
@@ -66,10 +66,6 @@ def make_coverage(
         planes.int(),
         members.blur(widths) if tile_widths is None else members.blur_by_pixel(widths, tile_widths, num_blurs),
     )
-
-
-def _reach(width: float) -> int:
-    return math.ceil(RADIUS_SIGMAS * width)
 
 
 def _split(pixels: Tensor, reach: int, outside: int) -> Tensor:
@@ -130,7 +126,7 @@ class _TileWidths:
 
     def reaches(self, widths: Sequence[float]) -> Tensor:
         """Return how far the pixels of each tile see, (tiles,)."""
-        return _on_device([_reach(width) for width in widths], self.counts.device)[self._widest]
+        return _on_device([reach_of(width) for width in widths], self.counts.device)[self._widest]
 
 
 class _Members(NamedTuple):

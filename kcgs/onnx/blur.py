@@ -10,8 +10,9 @@ import torch
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from kcgs.kernels.membership import RADIUS_SIGMAS, Membership
+from kcgs.kernels.membership import Membership
 from kcgs.kernels.tiles import TILE
+from kcgs.maps import RADIUS_SIGMAS
 
 from .graph import FLOAT, Graph, Value
 from .groups import Integers

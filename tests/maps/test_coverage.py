@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kcgs.kernels import Membership
-from kcgs.maps import Coverage, make_coverage
+from kcgs.maps import ContourWidths, Coverage, find_widths, make_coverage
 
 TILE = 16
 Widths = float | dict[tuple[int, int], float]
@@ -60,29 +60,29 @@ def tile_slices(shape: torch.Size) -> list[tuple[int, slice, slice]]:
     return [(b, slice(y, min(y + TILE, height)), slice(x, min(x + TILE, width))) for b, y, x in corners]
 
 
-def check(coverage: Coverage, membership: Membership) -> None:
+def check(coverage: Coverage, membership: Membership, contours: ContourWidths | None = None) -> None:
     """Compare with regions that are looked for pixel by pixel, and with dense weights."""
-    index, (widths, level) = membership.index, membership.levels
-    oracle = {
-        (b, r): membership.weights(b, r, torch.float64)
-        for b, r in itertools.product(range(len(index)), range(membership.num_regions))
-    }
+    index, (widths, width_index) = membership.index, contours or membership.levels
+    oracle = [
+        torch.stack([membership.weights(b, r, torch.float64) for r in range(membership.num_regions)])
+        for b in range(len(index))
+    ]
     tiles = tile_slices(index.shape)
     assert [part.dtype for part in coverage] == [torch.int32] * 3 + [torch.float32]
     starts, planes = coverage.starts.tolist(), coverage.planes.tolist()
     assert starts[0] == 0 and len(starts) == len(tiles) + 1 and starts[-1] == len(coverage.regions)
-    shared = [plane for plane in planes if plane >= 0]
-    assert shared == list(range(len(coverage.weights)))
+    assert [plane for plane in planes if plane >= 0] == list(range(len(coverage.weights)))
     for (b, rows, cols), first, end in zip(tiles, starts[:-1], starts[1:], strict=True):
-        reach = math.ceil(4 * widths[0 if level is None else int(level[b, rows, cols].max())])
-        around = (slice(max(s.start - reach, 0), s.start + TILE + reach) for s in (rows, cols))
-        regions = index[b][tuple(around)].unique().tolist()
-        assert coverage.regions[first:end].tolist() == regions
-        for region, plane in zip(regions, planes[first:end], strict=True):
-            assert (plane < 0) == (len(regions) == 1)
-            weights = torch.ones(TILE, TILE) if plane < 0 else coverage.weights[plane].view(TILE, TILE)
-            expected = oracle[b, region][rows, cols]
-            assert (weights[: expected.shape[0], : expected.shape[1]] - expected).abs().max() < 1e-6
+        reach = math.ceil(4 * widths[0 if width_index is None else int(width_index[b, rows, cols].max())])
+        around = [slice(max(s.start - reach, 0), s.start + TILE + reach) for s in (rows, cols)]
+        regions = index[b, around[0], around[1]].unique()
+        assert torch.equal(coverage.regions[first:end].long(), regions.long())
+        is_alone = len(regions) == 1
+        assert all((plane < 0) == is_alone for plane in planes[first:end])
+        expected = torch.zeros(membership.num_regions, TILE, TILE)
+        expected[regions.long()] = 1.0 if is_alone else coverage.weights[planes[first:end]].view(-1, TILE, TILE)
+        dense = oracle[b][:, rows, cols]
+        assert (expected[:, : dense.shape[1], : dense.shape[2]] - dense).abs().max() < 1e-6
 
 
 @pytest.mark.parametrize("softness", [0.0, 0.7, 3.0])
@@ -105,3 +105,23 @@ def test_wide_contours(softness: Widths, monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr("kcgs.maps.coverage._CHUNK_BYTES", 1 << 24)  # of many parts
     membership = membership_of(random_labels(1, 50, 70, regions=5, grain=17), softness)
     check(coverage_of(membership), membership)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 1, 60), (2, 40, 55), (1, 90, 3)])
+@pytest.mark.parametrize("values", [[0.0], [0.3, 0.9, 0.0, 1.4], [0.5, 12.0]])
+def test_widths_of_pixels(shape: tuple[int, int, int], values: list[float]) -> None:
+    """They are those of the nearest contours, ties included; beyond the reach of contours they do not matter."""
+    labels = random_labels(*shape, regions=6, grain=7)
+    membership = Membership(labels.int(), 6, pairs(6, values))
+    contours = find_widths(membership.index, 6, pairs(6, values))
+    check(make_coverage(membership.index, 6, *contours), membership, contours)
+    widths, level = membership.levels
+    pixels, expected = (
+        torch.full(shape, w[0]) if i is None else torch.tensor(w)[i.long()] for w, i in (contours, (widths, level))
+    )
+    is_far = torch.ones(shape).bool()
+    reach = math.ceil(4 * max(values))
+    for b, (y, x) in itertools.product(range(shape[0]), itertools.product(*map(range, shape[1:]))):
+        around = labels[b, max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1]
+        is_far[b, y, x] = bool((around == labels[b, y, x]).all())
+    assert torch.equal(pixels[~is_far], expected[~is_far])

@@ -1,0 +1,102 @@
+"""Widths of contours: of each pixel that of its nearest contour, by the two regions beside it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+# reach of a contour, in widths: the blur's kernel is cut there
+RADIUS_SIGMAS = 4.0
+# distances that are compared at once: 128 MiB in int32
+_CHUNK_DISTANCES = 1 << 25
+# more than any image has rows
+_FAR = 1 << 24
+# more than any pair of regions
+_NO_KEY = 1 << 62
+
+
+class ContourWidths(NamedTuple):
+    """The widths of contours, and the one of each pixel."""
+
+    widths: tuple[float, ...]  # pixels, ascending
+    pixels: Tensor | None  # [maps, H, W] int32, position in `widths`; None: one width everywhere
+
+
+def reach_of(width: float) -> int:
+    """Return how many pixels a contour of this width reaches."""
+    return math.ceil(RADIUS_SIGMAS * width)
+
+
+def find_widths(index: Tensor, num_regions: int, softness: float | Mapping[tuple[int, int], float]) -> ContourWidths:
+    """Give each pixel the width of its nearest contour, on the map's device, which the host does not wait for.
+
+    The nearest pixel that touches a contour has the same label: the way to another label crosses the contour earlier.
+    So the two regions are that pixel's, and that of the first of its neighbours that differs. Of pixels equally near
+    the leftmost counts, then the uppermost. Pixels that no contour reaches have the least width.
+
+    Args:
+        index: position of each pixel's region among the sorted ids, (maps, H, W) int32.
+        num_regions: number of ids.
+        softness: the width in pixels, or that of each pair (a, b) of positions with a < b, 0 where absent.
+    """
+    if not isinstance(softness, Mapping):
+        return ContourWidths((softness,), None)
+    widths = tuple(sorted({0.0, *softness.values()}))
+    places = {width: place for place, width in enumerate(widths)}
+    other = _neighbor_labels(index)
+    pairs = torch.minimum(index, other).long() * num_regions + torch.maximum(index, other)
+    own = _look_up(pairs, {a * num_regions + b: places[width] for (a, b), width in softness.items()})
+    row, down = _nearest_rows(other >= 0)
+    column, is_near = _nearest_columns(down, reach_of(widths[-1]))
+    return ContourWidths(widths, torch.where(is_near, own.gather(1, row).gather(2, column), 0))
+
+
+def _neighbor_labels(index: Tensor) -> Tensor:
+    """Return the first label beside each pixel (above, left, right, below) that differs from its own; -1: none."""
+    height, width = index.shape[1:]
+    padded = torch.nn.functional.pad(index, (1, 1, 1, 1), value=-1)
+    other = torch.full_like(index, -1)
+    for down, across in ((2, 1), (1, 2), (1, 0), (0, 1)):  # the first one overwrites the others
+        beside = padded[:, down : down + height, across : across + width]
+        other = torch.where((beside >= 0) & (beside != index), beside, other)
+    return other
+
+
+def _look_up(keys: Tensor, values: Mapping[int, int]) -> Tensor:
+    """Return the value of each key, int32; 0 where there is none."""
+    rows = torch.tensor([*sorted(values.items()), (_NO_KEY, 0)]).to(keys.device, non_blocking=True)
+    place = torch.searchsorted(rows[:, 0].contiguous(), keys)
+    return torch.where(rows[place, 0] == keys, rows[place, 1], 0).int()
+
+
+def _nearest_rows(touches: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the row of the nearest of the marked pixels above or below each pixel, and its distance."""
+    rows = torch.arange(touches.shape[1], device=touches.device)[:, None]
+    above = torch.where(touches, rows, -_FAR).cummax(1)[0]
+    below = torch.where(touches, rows, _FAR).flip(1).cummin(1)[0].flip(1)
+    nearest = torch.where(rows - above <= below - rows, above, below)
+    return nearest.clamp(0, len(rows) - 1), (rows - nearest).abs()
+
+
+def _nearest_columns(down: Tensor, reach: int) -> tuple[Tensor, Tensor]:
+    """Return the column of the nearest marked pixel for the distances of those within columns, and whether it is near.
+
+    A contour that lies within reach along both axes is near; none is searched farther along one of them.
+    """
+    maps, _, width = down.shape
+    limit = math.floor(math.sqrt(2) * reach) + 1
+    side = min(limit, width) - 1
+    offsets = torch.arange(-side, side + 1, device=down.device, dtype=torch.int32)
+    squares = torch.nn.functional.pad(down.clamp_max(limit).int().square(), (side, side), value=limit**2)
+    order = len(offsets) * offsets.square() + offsets + side  # of equal distances the leftmost is the least
+    length = max(1, _CHUNK_DISTANCES // (maps * width * len(offsets)))
+    nearest = torch.cat(
+        [(len(offsets) * part.unfold(2, len(offsets), 1) + order).amin(3) for part in squares.split(length, 1)],
+        1,
+    )
+    column = torch.arange(width, device=down.device) + nearest % len(offsets) - side
+    return column.clamp(0, width - 1), nearest // len(offsets) < limit**2
