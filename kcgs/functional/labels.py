@@ -164,10 +164,14 @@ def union_find(ids: Iterable[int], pairs: Iterable[tuple[int, int]]) -> Callable
 def compact(labels: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
     """Return the sorted ids, each pixel's position among them, and for small ids a table from id + 1 to position.
 
-    The table begins and ends with -1, for ids below and beyond it.
+    The table begins and ends with -1, for ids below and beyond it. Other devices than the CPU are waited for once, and
+    have none.
     """
+    if labels.device.type != "cpu":
+        ids = labels.unique()
+        return ids, torch.searchsorted(ids, labels.contiguous(), out_int32=True), None
     if int(labels.max()) < _TABLE_IDS:
-        present = torch.bincount(labels.flatten()) > 0
+        present = torch.bincount(labels.unique_consecutive()) > 0
         ids = present.nonzero().flatten()
         table = torch.where(present, present.cumsum(0) - 1, -1)
         index = table.to(torch.int32).index_select(0, labels.flatten()).view(labels.shape)

@@ -28,7 +28,9 @@ class MapTables(NamedTuple):
     """The regions of a map, and which of them each pixel belongs to."""
 
     ids: Tensor  # [R] int64, sorted
-    positions: Tensor | None  # from id + 1 to its position among `ids`, -1 at both ends; None where ids are large
+    positions: (
+        Tensor | None
+    )  # from id + 1 to its position among `ids`, -1 at both ends; None: ids are large, or not on the CPU
     softness: float | PairSoftness
     membership: Membership
 

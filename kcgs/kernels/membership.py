@@ -14,14 +14,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcgs.maps import RADIUS_SIGMAS
+from kcgs.maps import RADIUS_SIGMAS, TILE, Coverage, find_widths, make_coverage
 
 from .antialiasing import SmoothLabels
 
 T = TypeVar("T")
 
-# windows of a task
+# windows of a task, and tiles
 _TASK_WINDOWS = 32
+_TASK_TILES = 64
 
 
 class TileMembership(NamedTuple):
@@ -126,18 +127,9 @@ class Membership:
         """Return the tables for square tiles of `tile` pixels."""
         return self.derived(("tiles", tile), lambda _: self._build_tiles(tile))
 
-    @property
     def coverage(self) -> Coverage:
-        """The same table as `Coverage`."""
-        return self.derived("coverage", lambda m: m._cover())
-
-    def _cover(self) -> Coverage:
-        keys, planes, masks = self.tiles(TILE)
-        maps, height, width = self.index.shape
-        count = maps * -(-height // TILE) * -(-width // TILE)
-        bounds = torch.arange(count + 1, device=keys.device) * self.num_regions
-        starts = torch.searchsorted(keys, bounds, out_int32=True)
-        return Coverage(starts, (keys % self.num_regions).int(), planes.int(), masks.float())
+        """Return the table for tiles of 16 pixels, on the map's device."""
+        return self.derived("coverage", lambda _: self._build_coverage())
 
     def full_map(self, batch: int, region: int, tile: int = 16) -> Tensor:
         """Assemble s_r of one region from the tables of tiles, (H, W) float64."""
@@ -160,19 +152,44 @@ class Membership:
         return value
 
     def _build_tiles(self, tile: int) -> TileMembership:
+        place, reaches = self._place_tiles(tile)
+        single, keys = self.list_keys(place, (tile, tile), reaches)
+        masks = self.window_weights(place[keys // self.num_regions], keys % self.num_regions, (tile, tile)).flatten(1)
+        return TileMembership.assemble(single, keys, masks.bool() if self.levels.widths == (0.0,) else masks)
+
+    def _place_tiles(self, tile: int) -> tuple[Tensor, Tensor]:
+        """Return map, first row and first column of each tile, (T, 3), and how far its pixels see, (T,)."""
         widths, level = self.levels
         maps, height, width = self.index.shape
         counts = (maps, -(-height // tile), -(-width // tile))
         place = torch.cartesian_prod(*[torch.arange(n, device=self.index.device) for n in counts])
         place[:, 1:] *= tile
-        # the widest contour of a tile decides how far its pixels see
+        # the widest contour of a tile decides
         reaches = torch.tensor([self._reach(contour) + self.margin for contour in widths], device=place.device)
         widest = torch.zeros(len(place), dtype=torch.int64, device=place.device)
         if level is not None:
             widest = torch.nn.functional.max_pool2d(level.float(), tile, ceil_mode=True).flatten().long()
-        single, keys = self.list_keys(place, (tile, tile), reaches[widest])
-        masks = self.window_weights(place[keys // self.num_regions], keys % self.num_regions, (tile, tile)).flatten(1)
-        return TileMembership.assemble(single, keys, masks.bool() if widths == (0.0,) else masks)
+        return place, reaches[widest]
+
+    def _build_coverage(self) -> Coverage:
+        if self.index.device.type != "cpu":
+            return make_coverage(
+                self.index, self.num_regions, *find_widths(self.index, self.num_regions, self.softness)
+            )
+        from .tasks import ranges, run_tasks  # loads numba
+        from .windows import fill_planes, list_regions
+
+        index, (place, reaches) = _array(self.index), self._place_tiles(TILE)
+        counts, regions = list_regions(index, place.numpy(), (TILE, TILE), reaches.numpy(), self.num_regions)
+        starts = np.zeros(len(counts) + 1, np.int32)
+        np.cumsum(counts, out=starts[1:])
+        is_shared = np.repeat(counts > 1, counts)
+        ends = np.cumsum(is_shared, dtype=np.int32)
+        planes = np.where(is_shared, ends - 1, np.int32(-1))
+        weights = np.empty((ends[-1], TILE * TILE), np.float32)
+        arguments = index, *self._blur_arrays(), starts, regions, planes, weights
+        run_tasks(partial(fill_planes, *arguments), ranges(len(counts), _TASK_TILES))
+        return Coverage(*map(torch.from_numpy, (starts, regions, planes, weights)))
 
     def list_keys(self, place: Tensor, sides: Sequence[int], reaches: Tensor) -> tuple[Tensor, Tensor]:
         """List keys, tile * num_regions + region, of tiles with one region, and of tiles with several; both sorted.
@@ -200,17 +217,20 @@ class Membership:
         from .tasks import ranges, run_tasks  # loads numba
         from .windows import fill_weights
 
-        widths, level = self.levels
-        offsets = torch.arange(self.radius + 1)
-        taps = torch.stack([self._gaussian(offsets, width) if width else (offsets == 0).double() for width in widths])
-        levels = np.empty((0, 0, 0), np.int32) if level is None else _array(level)
         weights = np.zeros((len(region), *span))
         labels = self.smooth_labels
         none = np.empty((0, 0, 0))
         parts = (none, none.astype(np.int32), none) if labels is None else map(_array, labels)
-        arguments = _array(self.index), *parts, levels, taps.numpy(), _array(place), _array(region), weights
+        arguments = _array(self.index), *parts, *self._blur_arrays(), _array(place), _array(region), weights
         run_tasks(partial(fill_weights, *arguments), ranges(len(region), _TASK_WINDOWS))
         return torch.from_numpy(weights).to(region.device)
+
+    def _blur_arrays(self) -> tuple[Any, Any]:
+        """Return the levels of pixels and halves of blurs, as the loops over windows take them."""
+        widths, level = self.levels
+        offsets = torch.arange(self.radius + 1)
+        taps = torch.stack([self._gaussian(offsets, width) if width else (offsets == 0).double() for width in widths])
+        return np.empty((0, 0, 0), np.int32) if level is None else _array(level), taps.numpy()
 
     def read(self, pixels: Tensor, place: Tensor, span: Sequence[int]) -> Tensor:
         """Read (B, H, W) over windows, (P, *span), at places as of `window_weights`; the border repeats."""

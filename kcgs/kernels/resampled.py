@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+
+from kcgs.maps import TILE, Coverage
 
 from .antialiasing import SmoothLabels, antialias
 from .membership import Levels, Membership, TileMembership
@@ -107,6 +110,13 @@ class Resampled(Membership):
         """Return the axes of rows and columns, padded to whole tiles with their last pixel."""
         sizes = zip(self.index.shape[1:], self.source.index.shape[1:], strict=True)
         return tuple(_axis(new, old, tile, self.index.device) for new, old in sizes)  # type: ignore[return-value]
+
+    def _build_coverage(self) -> Coverage:
+        keys, rows, masks = self.tiles(TILE)
+        tiles = self.index.shape[0] * math.prod(-(-side // TILE) for side in self.index.shape[1:])
+        firsts = torch.arange(tiles + 1, device=keys.device) * self.num_regions
+        starts = torch.searchsorted(keys, firsts, out_int32=True)
+        return Coverage(starts, (keys % self.num_regions).int(), rows.int(), masks.float())
 
     def _build_tiles(self, tile: int) -> TileMembership:
         maps = self.index.shape[0]

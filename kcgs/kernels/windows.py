@@ -9,6 +9,8 @@ from .tasks import first_task, next_task
 
 program = Program("tables of label maps")
 
+SIDE = 16  # of a tile of `Coverage`: a number, so that the compiler makes vectors of rows
+
 
 @program.entry
 def list_regions(index, places, sides, reaches, num_regions):  # type: ignore[no-untyped-def]
@@ -16,7 +18,7 @@ def list_regions(index, places, sides, reaches, num_regions):  # type: ignore[no
 
     Windows of `sides` pixels begin at places, (T, 3): map, first row, first column; each is widened by its reach.
     """
-    counts, regions = np.empty(len(places), np.int64), np.empty(len(places) + 1, np.int64)
+    counts, regions = np.empty(len(places), np.int64), np.empty(len(places) + 1, np.int32)
     windows = np.full(num_regions, -1)  # the last that holds a region
     end, (_, height, width) = 0, index.shape
     for t in range(len(places)):
@@ -85,6 +87,113 @@ def fill_weights(index, weight, other, other_weight, levels, taps, places, regio
                         if not len(levels) or _level(levels[image], top + y, left + x) == k:
                             weights[p, y, x] = total[x] / max(down[y] * across[x], 1e-300)
         task = next_task(tasks, counters)
+
+
+@program.entry
+def fill_planes(index, levels, taps, starts, regions, planes, weights, tasks, counters):  # type: ignore[no-untyped-def]
+    """Fill the membership of regions in the tiles of a `Coverage` that several share; otherwise as `fill_weights`.
+
+    Tasks are ranges of tiles.
+    """
+    _, height, width = index.shape
+    rows, cols = (height + SIDE - 1) // SIDE, (width + SIDE - 1) // SIDE
+    side = SIDE + 2 * (taps.shape[1] - 1)
+    labels, member, blurred = np.empty((side, side), np.int32), np.empty(side), np.empty((side, SIDE))
+    is_empty, total = np.empty(side, np.bool_), np.empty((SIDE, SIDE))
+    task = first_task(tasks, counters)
+    while task >= 0:
+        for tile in range(tasks[task, 1], tasks[task, 2]):
+            first, end = starts[tile], starts[tile + 1]
+            if end - first < 2:
+                continue
+            image, top, left = tile // (rows * cols), tile // cols % rows * SIDE, tile % cols * SIDE
+            if side == SIDE:
+                _read_labels(index[image], top, left, side, labels)
+                for entry in range(first, end):
+                    _mark_members(labels.ravel(), regions[entry], weights[planes[entry]])
+                continue
+            for k in range(len(taps)):
+                if len(levels) and not _has_level(levels[image], k, top, left, SIDE, SIDE):
+                    continue
+                half = taps[k, : np.count_nonzero(taps[k])]
+                n = len(half) - 1
+                down, across = _sum_inside(half, top, SIDE, height), _sum_inside(half, left, SIDE, width)
+                _read_labels(index[image], top - n, left - n, SIDE + 2 * n, labels)
+                for entry in range(first, end):
+                    for y in range(SIDE + 2 * n):
+                        is_empty[y] = _blur_members(half, labels[y], regions[entry], member, blurred[y])
+                    _blur_rows(half, blurred, is_empty, total)
+                    _divide(total, down, across)
+                    _copy_level(total, levels, k, (image, top, left), weights[planes[entry]])
+        task = next_task(tasks, counters)
+
+
+@inner
+def _read_labels(index, top, left, side, labels):  # type: ignore[no-untyped-def]
+    """Read a square of an image, -1 beyond it."""
+    first, end = max(-left, 0), min(side, index.shape[1] - left)
+    for y in range(side):
+        labels[y] = -1
+        if 0 <= top + y < index.shape[0]:
+            labels[y, first:end] = index[top + y, left + first : left + end]
+
+
+@inner
+def _mark_members(labels, region, weights):  # type: ignore[no-untyped-def]
+    """Fill the weights of a tile with hard contours."""
+    for k in range(SIDE * SIDE):
+        weights[k] = np.float32(labels[k] == region)
+
+
+@inner
+def _blur_members(half, labels, region, member, blurred):  # type: ignore[no-untyped-def]
+    """Blur what is of a region in a line of a tile's window; return whether nothing is."""
+    n = len(half) - 1
+    count = 0
+    for x in range(SIDE + 2 * n):
+        member[x] = labels[x] == region
+        count += labels[x] == region
+    if count == 0:
+        return True
+    for x in range(SIDE):
+        blurred[x] = 0.0
+    for t in range(2 * n + 1):
+        tap = half[abs(t - n)]
+        for x in range(SIDE):
+            blurred[x] += tap * member[x + t]
+    return False
+
+
+@inner
+def _blur_rows(half, rows, is_empty, blurred):  # type: ignore[no-untyped-def]
+    """Blur the rows of a tile's window to those of the tile."""
+    n = len(half) - 1
+    for y in range(SIDE):
+        total = blurred[y]
+        for x in range(SIDE):
+            total[x] = 0.0
+        for t in range(2 * n + 1):
+            if not is_empty[y + t]:
+                tap, row = half[abs(t - n)], rows[y + t]
+                for x in range(SIDE):
+                    total[x] += tap * row[x]
+
+
+@inner
+def _divide(total, down, across):  # type: ignore[no-untyped-def]
+    for y in range(SIDE):
+        for x in range(SIDE):
+            total[y, x] /= max(down[y] * across[x], 1e-300)
+
+
+@inner
+def _copy_level(total, levels, k, place, weights):  # type: ignore[no-untyped-def]
+    """Copy the pixels of a level; where there is one, all."""
+    image, top, left = place
+    for y in range(SIDE):
+        for x in range(SIDE):
+            if not len(levels) or _level(levels[image], top + y, left + x) == k:
+                weights[y * SIDE + x] = total[y, x]
 
 
 @inner

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import itertools
 import math
+import warnings
+from collections.abc import Callable
 
 import pytest
 import torch
 from torch import Tensor
 
-from kcgs.kernels import Membership
+from kcgs.functional.labels import compact
+from kcgs.kernels import Membership, Resampled
 from kcgs.maps import ContourWidths, Coverage, find_widths, make_coverage
 
 TILE = 16
@@ -50,8 +53,12 @@ def membership_of(labels: Tensor, softness: Widths) -> Membership:
     return Membership(labels.int(), int(labels.max()) + 1, softness)
 
 
-def coverage_of(membership: Membership) -> Coverage:
-    return make_coverage(membership.index, membership.num_regions, *membership.levels)
+@pytest.fixture(params=["torch", "compiled"])
+def coverage_of(request: pytest.FixtureRequest) -> Callable[[Membership], Coverage]:
+    """The table as any device makes it, and as the CPU does."""
+    if request.param == "compiled":
+        return Membership.coverage
+    return lambda membership: make_coverage(membership.index, membership.num_regions, *membership.levels)
 
 
 def tile_slices(shape: torch.Size) -> list[tuple[int, slice, slice]]:
@@ -87,13 +94,13 @@ def check(coverage: Coverage, membership: Membership, contours: ContourWidths | 
 
 @pytest.mark.parametrize("softness", [0.0, 0.7, 3.0])
 @pytest.mark.parametrize("name", MAPS)
-def test_one_width(name: str, softness: float) -> None:
+def test_one_width(name: str, softness: float, coverage_of: Callable[[Membership], Coverage]) -> None:
     membership = membership_of(MAPS[name], softness)
     check(coverage_of(membership), membership)
 
 
 @pytest.mark.parametrize("name", ["one row", "eight in a tile", "batch", "pixels"])
-def test_widths_of_pairs(name: str) -> None:
+def test_widths_of_pairs(name: str, coverage_of: Callable[[Membership], Coverage]) -> None:
     softness = pairs(int(MAPS[name].max()) + 1, [0.7, 0.0, 2.2, 1.1])
     membership = membership_of(MAPS[name], softness)
     assert membership.levels.level is not None
@@ -101,7 +108,9 @@ def test_widths_of_pairs(name: str) -> None:
 
 
 @pytest.mark.parametrize("softness", [64.0, pairs(5, [64.0, 0.5, 20.0])])
-def test_wide_contours(softness: Widths, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wide_contours(
+    softness: Widths, coverage_of: Callable[[Membership], Coverage], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("kcgs.maps.coverage._CHUNK_BYTES", 1 << 24)  # of many parts
     membership = membership_of(random_labels(1, 50, 70, regions=5, grain=17), softness)
     check(coverage_of(membership), membership)
@@ -125,3 +134,41 @@ def test_widths_of_pixels(shape: tuple[int, int, int], values: list[float]) -> N
         around = labels[b, max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1]
         is_far[b, y, x] = bool((around == labels[b, y, x]).all())
     assert torch.equal(pixels[~is_far], expected[~is_far])
+
+
+@pytest.mark.parametrize("softness", [0.0, 1.5])
+def test_another_size(softness: float) -> None:
+    membership = membership_of(MAPS["batch"], softness)
+    index = torch.nn.functional.interpolate(MAPS["batch"][None].float(), (52, 40))[0].int()
+    resampled = Resampled(index, membership)
+    coverage, table = resampled.coverage(), resampled.tiles(TILE)
+    tile = torch.repeat_interleave(coverage.starts.diff())
+    assert torch.equal(tile * membership.num_regions + coverage.regions, table.keys)
+    assert torch.equal(coverage.planes.long(), table.mask_rows)
+    assert torch.equal(coverage.weights, table.masks.float())
+
+
+@pytest.mark.parametrize("softness", [0.0, 0.7, pairs(4, [0.5, 0.0, 2.0])])
+def test_devices_agree(softness: Widths, device: torch.device) -> None:
+    membership = membership_of(MAPS["batch"], softness)
+    moved = membership.to(device)
+    coverage, contours = moved.coverage(), None
+    if device.type != "cpu":
+        widths, pixels = find_widths(moved.index, moved.num_regions, softness)
+        contours = ContourWidths(widths, None if pixels is None else pixels.cpu())
+    check(Coverage(*(part.cpu() for part in coverage)), membership, contours)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("softness", [0.0, 0.7, pairs(4, [0.5, 0.0, 2.0])])
+def test_waits_for_the_device(softness: Widths) -> None:
+    labels = MAPS["batch"].cuda()
+    with warnings.catch_warnings(record=True) as waits:
+        warnings.simplefilter("always")
+        torch.cuda.set_sync_debug_mode("warn")
+        try:
+            ids, index, _ = compact(labels)
+            Membership(index, len(ids), softness).coverage()
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+    assert len([wait for wait in waits if "synchroniz" in str(wait.message)]) <= 3
