@@ -258,23 +258,21 @@ def _find_levels(membership: Membership) -> Levels:
     """
     if not isinstance(membership.softness, Mapping):
         return Levels((membership.softness,), None)
-    from scipy.ndimage import distance_transform_edt
+    from .nearest import spread  # loads numba
 
-    maps = membership.index.cpu().numpy()
-    other = np.stack([_neighbor_labels(labels) for labels in maps])
+    maps = _array(membership.index)
+    other = _neighbor_labels(maps)
     touches = other >= 0
-    low, high = np.sort([maps[touches], other[touches]], axis=0).astype(np.int64)
-    pairs, pair_index = np.unique(low * membership.num_regions + high, return_inverse=True)
+    own, beside = maps[touches].astype(np.int64), other[touches]
+    keys = np.minimum(own, beside) * membership.num_regions + np.maximum(own, beside)
+    pairs, pair_index = np.unique(keys, return_inverse=True)
     pair_widths = [membership.softness.get(divmod(pair, membership.num_regions), 0.0) for pair in pairs.tolist()]
     if len(set(pair_widths)) < 2:
         return Levels((pair_widths[0] if pair_widths else 0.0,), None)
     widths, pair_levels = np.unique(pair_widths, return_inverse=True)
-    level = np.zeros(maps.shape, np.int32)
-    level[touches] = pair_levels[pair_index]
-    for map_level, contour in zip(level, touches, strict=True):
-        if contour.any():
-            rows, cols = distance_transform_edt(~contour, return_distances=False, return_indices=True)
-            map_level[:] = map_level[rows, cols]
+    contours, level = np.full(maps.shape, -1, np.int32), np.zeros(maps.shape, np.int32)
+    contours[touches] = pair_levels[pair_index]
+    spread(contours, level)
     return Levels(tuple(widths.tolist()), torch.from_numpy(level).to(membership.index.device))
 
 
@@ -291,11 +289,11 @@ def _neighbor_labels(labels: Any) -> Any:
     earlier = slice(None, -1)
     every = slice(None)
     for pixel, neighbour in (
-        ((later, every), (earlier, every)),
-        ((every, later), (every, earlier)),
-        ((every, earlier), (every, later)),
-        ((earlier, every), (later, every)),
+        ((..., later, every), (..., earlier, every)),
+        ((..., every, later), (..., every, earlier)),
+        ((..., every, earlier), (..., every, later)),
+        ((..., earlier, every), (..., later, every)),
     ):
         differs = (labels[pixel] != labels[neighbour]) & (other[pixel] < 0)
-        other[pixel][differs] = labels[neighbour][differs]
+        np.copyto(other[pixel], labels[neighbour], where=differs)
     return other

@@ -17,7 +17,7 @@ from .widths import RADIUS_SIGMAS, reach_of
 
 TILE = 16  # pixels along a side
 # bytes of windows and what is made of them at once
-_CHUNK_BYTES = 1 << 28
+_CHUNK_BYTES = 1 << 27
 # bytes per pixel of a window in a list: the label, its tests, its key
 _LISTED_BYTES = 24
 

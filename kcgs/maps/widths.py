@@ -11,8 +11,8 @@ from torch import Tensor
 
 # reach of a contour, in widths: the blur's kernel is cut there
 RADIUS_SIGMAS = 4.0
-# distances that are compared at once: 128 MiB in int32
-_CHUNK_DISTANCES = 1 << 25
+# distances that are compared at once: 64 MiB in int32
+_CHUNK_DISTANCES = 1 << 24
 # more than any image has rows
 _FAR = 1 << 24
 # more than any pair of regions

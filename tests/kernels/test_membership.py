@@ -14,6 +14,7 @@ from torch import Tensor
 from kcgs import RegionMap
 from kcgs.functional import region_splat
 from kcgs.kernels.membership import Membership
+from kcgs.kernels.nearest import spread
 from kcgs.kernels.tiles import TILE
 
 Widths = float | dict[tuple[int, int], float]
@@ -193,3 +194,17 @@ def test_kernels_agree_on_widths_of_pairs() -> None:
         for value, expected in zip(result, results[0], strict=True):
             assert expected.std() > 0.1
             assert (value - expected).abs().max() < 1e-5 * max(1.0, float(expected.abs().max()))
+
+
+def test_level_of_the_nearest_contour() -> None:
+    """Ties included: pixels have that of scipy's nearest pixel."""
+    generator = torch.Generator().manual_seed(0)
+    values = torch.randint(0, 50, (40, 13, 17), generator=generator, dtype=torch.int32)
+    values[torch.rand(values.shape, generator=generator) < torch.linspace(0.5, 0.99, 40)[:, None, None]] = -1
+    values[0] = -1
+    nearest = np.full(values.shape, 7, np.int32)
+    spread(values.numpy(), nearest)
+    assert (nearest[0] == 7).all()
+    for found, sources in zip(nearest[1:], values[1:].numpy(), strict=True):
+        rows, cols = ndimage.distance_transform_edt(sources < 0, return_distances=False, return_indices=True)
+        assert (found == sources[rows, cols]).all()

@@ -1,0 +1,72 @@
+"""Loops that give pixels the value of the nearest one that has one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .compiled import Program, inner
+
+program = Program("tables of label maps")
+
+
+@program.entry
+def spread(values, nearest):  # type: ignore[no-untyped-def]
+    """Fill nearest, (maps, H, W), with the values of the nearest pixels that have one, not -1; else it stays.
+
+    Of pixels equally near the leftmost counts, then the uppermost, as in scipy's distance transform.
+    """
+    _, height, width = values.shape
+    rows, below = np.empty((height, width), np.int64), np.empty(width, np.int64)
+    columns, begins = np.empty(width, np.int64), np.empty(width, np.int64)
+    for k in range(len(values)):
+        _find_rows(values[k], rows, below)
+        for y in range(height):
+            end = width
+            for c in range(_find_columns(rows[y], y, columns, begins) - 1, -1, -1):
+                column = columns[c]
+                value = values[k, rows[y, column], column]
+                for x in range(begins[c], end):
+                    nearest[k, y, x] = value
+                end = begins[c]
+
+
+@inner
+def _find_rows(values, rows, below):  # type: ignore[no-untyped-def]
+    """Fill the row of the nearest pixel with a value in each pixel's column; -1: there is none."""
+    height, width = values.shape
+    below[:] = -1
+    for y in range(height):
+        for x in range(width):
+            below[x] = y if values[y, x] >= 0 else below[x]
+            rows[y, x] = below[x]
+    below[:] = -1
+    for y in range(height - 1, -1, -1):
+        for x in range(width):
+            above = rows[y, x]
+            below[x] = y if values[y, x] >= 0 else below[x]
+            if above < 0 or 0 <= below[x] - y < y - above:
+                rows[y, x] = below[x]
+
+
+@inner
+def _find_columns(rows, y, columns, begins):  # type: ignore[no-untyped-def]
+    """List the columns whose nearest pixels are the nearest ones of a row, and where each begins to be; their number.
+
+    Source: Meijster, Roerdink, Hesselink, "A general algorithm for computing distance transforms in linear time".
+    """
+    count = 0
+    for x in range(len(rows)):
+        if rows[x] < 0:
+            continue
+        begin, square = 0, (rows[x] - y) ** 2 + x**2
+        while count > 0:
+            other = columns[count - 1]
+            begin = (square - (rows[other] - y) ** 2 - other**2) // (2 * (x - other)) + 1  # from here on x is nearer
+            if begin > begins[count - 1]:
+                break
+            begin = 0
+            count -= 1
+        if begin < len(rows):
+            columns[count], begins[count] = x, begin
+            count += 1
+    return count
