@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterable, Iterator
+from importlib.util import find_spec
 from typing import Any
 
 import torch
@@ -102,7 +104,8 @@ class GaussianAdam(Optimizer):
             closure: evaluates the loss anew, and returns it.
 
         Raises:
-            ValueError: a gradient that is not finite, before anything moves.
+            ValueError: a gradient that is not finite, on the CPU, before anything moves. On another device, where the
+                step waits for nothing, the Gaussian of such a gradient stays as it is.
         """
         loss = None
         if closure is not None:
@@ -110,11 +113,24 @@ class GaussianAdam(Optimizer):
                 loss = closure()
         for parameter in (parameter for group in self.param_groups for parameter in group["params"]):
             _check_gradient(parameter.grad)
-        for group in self.param_groups:
-            if any(parameter.grad is not None for parameter in group["params"]):
-                step = _step_geometry if group["kind"] == "geometry" else _step_colors
-                step(self.state[group["params"][0]], group)
+        for geometry, colors in zip(self.param_groups[::2], self.param_groups[1::2], strict=True):
+            self._step_field(geometry, colors)
         return loss
+
+    def _step_field(self, geometry: dict[str, Any], colors: dict[str, Any]) -> None:
+        """Move the Gaussians of one field."""
+        groups = [group for group in (geometry, colors) if _has_gradient(group)]
+        for group in groups:
+            _begin(self.state[group["params"][0]], group)
+        parameters = geometry["params"] + colors["params"]
+        averages = [average for group in groups for average in self.state[group["params"][0]].values()]
+        if _is_launched(*parameters, *averages):
+            _launch(self.state, geometry, colors)
+            return
+        finite = None if _raises(parameters[0]) else _finite_rows(parameters)
+        for group in groups:
+            step = _step_geometry if group is geometry else _step_colors
+            step(self.state[group["params"][0]], group, finite)
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """Refuse groups that are no field's: torch calls this when the optimizer is made."""
@@ -199,27 +215,25 @@ def _layout(field: GaussianField) -> str:
     return " and ".join([f"colors ({', '.join(map(str, [*batch, 'N', channels]))})", *optional])
 
 
-def _step_colors(state: dict[str, Tensor], group: dict[str, Any]) -> None:
+def _step_colors(state: dict[str, Tensor], group: dict[str, Any], finite: Tensor | None) -> None:
     colors, *opacities = group["params"]
     tables = [colors, *(alpha[..., None] for alpha in opacities)]
     gradients = [_gradient(colors), *(_gradient(alpha)[..., None] for alpha in opacities)]
     gradient = torch.cat(gradients, -1) if opacities else gradients[0]
-    _begin(state, colors, gradient.shape[-1])
     if _is_compiled(*tables, *state.values()):
         from . import loops  # loads numba
 
         loops.step_tables(tuple(_rows(*tables)), *_rows(gradient), loops.Adam(*_settings(group), *_averages(state)))
         increment_version(group["params"])
         return
-    change = _adam(state, gradient, group)
+    change = _adam(state, gradient, group, finite)
     for table, part in zip(tables, change.split([table.shape[-1] for table in tables], -1), strict=True):
-        table.add_(part)
+        _write(table, table + part, finite)
 
 
-def _step_geometry(state: dict[str, Tensor], group: dict[str, Any]) -> None:
+def _step_geometry(state: dict[str, Tensor], group: dict[str, Any], finite: Tensor | None) -> None:
     means, cholesky = group["params"]
     gradients = [_gradient(means), _gradient(cholesky)]
-    _begin(state, means, 5)
     if _is_compiled(means, cholesky, *state.values()):
         from . import loops  # loads numba
 
@@ -229,11 +243,53 @@ def _step_geometry(state: dict[str, Tensor], group: dict[str, Any]) -> None:
         loops.step_geometry(*_rows(means, cholesky, *gradients), moves, adam, bounds)
         increment_version([parameter for parameter in group["params"] if parameter.requires_grad])
         return
-    step = _adam(state, local_gradient(cholesky, *gradients), group).clamp(-group["max_step"], group["max_step"])
+    step = _adam(state, local_gradient(cholesky, *gradients), group, finite)
+    step = step.clamp(-group["max_step"], group["max_step"])
     bounded = _bounded(*move(means, cholesky, step), group["size"], group["min_sigma"])
     for parameter, values in zip((means, cholesky), bounded, strict=True):
         if parameter.requires_grad:  # a frozen one is not even brought within bounds
-            parameter.copy_(values)
+            _write(parameter, values, finite)
+
+
+def _launch(state: dict[Tensor, Any], geometry: dict[str, Any], colors: dict[str, Any]) -> None:
+    """Take the step of a field on a CUDA device, geometry and colours at once."""
+    from . import cuda  # loads triton
+
+    gradients, adams = [], []
+    for group in (geometry, colors):
+        moves, averages = _has_gradient(group), state[group["params"][0]].values()
+        gradients += [_gradient(p).contiguous() if moves and p.requires_grad else None for p in group["params"]]
+        # where nothing moves any address will do: it is not read
+        adams.append(cuda.Adam(*_settings(group), *(averages if moves else group["params"][:1] * 3)))
+    size, min_sigma = geometry["size"], geometry["min_sigma"]
+    limits = geometry["max_step"], *size, math.hypot(*size), min_sigma, _MIN_FACTOR, _MAX_OUTSIDE
+    parameters = geometry["params"] + colors["params"]
+    bounds = cuda.Bounds(*map(float, limits))
+    cuda.step(parameters, gradients, adams[0], adams[1], bounds)
+    increment_version([p for p, gradient in zip(parameters, gradients, strict=True) if gradient is not None])
+
+
+def _has_gradient(group: dict[str, Any]) -> bool:
+    return any(parameter.grad is not None for parameter in group["params"])
+
+
+def _raises(parameter: Tensor) -> bool:
+    """True where gradients that are not finite are an error: reading values of a device would wait for it."""
+    return parameter.is_cpu
+
+
+@functools.cache
+def _has_triton() -> bool:
+    return find_spec("triton") is not None
+
+
+def _is_launched(*tensors: Tensor) -> bool:
+    """True where the kernel of Triton may read and change the memory of tensors."""
+    return (
+        not torch.compiler.is_compiling()
+        and all(t.dtype is torch.float32 and t.is_cuda and t.is_contiguous() for t in tensors)
+        and _has_triton()
+    )
 
 
 def _is_compiled(*tensors: Tensor) -> bool:
@@ -248,8 +304,11 @@ def _rows(*tensors: Tensor) -> list[Any]:
     return [t.detach().contiguous().numpy().reshape(-1, t.shape[-1]) for t in tensors]
 
 
-def _settings(group: dict[str, Any]) -> Iterator[float]:
-    return map(float, (group["lr"], *group["betas"], group["eps"]))
+def _settings(group: dict[str, Any]) -> list[Any]:
+    """Return learning rate, betas and eps as floats; a rate on a device, which a captured graph reads, stays there."""
+    rate = group["lr"]
+    on_device = isinstance(rate, Tensor) and not _raises(rate)
+    return [rate if on_device else float(rate), *map(float, (*group["betas"], group["eps"]))]
 
 
 def _averages(state: dict[str, Tensor]) -> list[Any]:
@@ -257,7 +316,7 @@ def _averages(state: dict[str, Tensor]) -> list[Any]:
 
 
 def _check_gradient(gradient: Tensor | None) -> None:
-    if gradient is None:
+    if gradient is None or not _raises(gradient):
         return
     if _is_compiled(gradient):
         from . import loops  # loads numba
@@ -275,23 +334,41 @@ def _gradient(parameter: Tensor) -> Tensor:
     return torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
 
 
-def _begin(state: dict[str, Tensor], parameter: Tensor, columns: int) -> None:
-    """Make the averages of a table (..., N, columns), if there are none; each row has an age of its own."""
+def _begin(state: dict[str, Tensor], group: dict[str, Any]) -> None:
+    """Make the averages of a group (..., N, K), if there are none; each row has an age of its own."""
     if not state:
+        first, *others = group["params"]
+        columns = 5 if group["kind"] == "geometry" else first.shape[-1] + len(others)
         for name, width in {"age": 1, "average": columns, "square": columns}.items():
-            state[name] = parameter.new_zeros(*parameter.shape[:-1], width)
+            state[name] = first.new_zeros(*first.shape[:-1], width)
 
 
-def _adam(state: dict[str, Tensor], gradient: Tensor, group: dict[str, Any]) -> Tensor:
-    """Update the averages of a table (..., N, K), and return Adam's step."""
+def _adam(state: dict[str, Tensor], gradient: Tensor, group: dict[str, Any], finite: Tensor | None) -> Tensor:
+    """Update the averages of a table (..., N, K), in rows of finite gradients, and return Adam's step."""
     beta1, beta2 = group["betas"]
+    previous = [] if finite is None else [values.clone() for values in state.values()]
     age, average, square = state["age"], state["average"], state["square"]
     age += 1
     average.lerp_(gradient, 1 - beta1)
     square.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
     scale = (square / (1 - beta2**age)).sqrt_().add_(group["eps"])
     step: Tensor = average / (1 - beta1**age) / scale * -group["lr"]
+    if finite is not None:
+        for values, old in zip(state.values(), previous, strict=True):
+            values.copy_(torch.where(finite, values, old))
     return step
+
+
+def _finite_rows(parameters: list[Tensor]) -> Tensor:
+    """Return a mask of the Gaussians whose gradients are finite, (..., N, 1)."""
+    means, *others = (_gradient(parameter) for parameter in parameters)
+    tables = [means, *(table if table.ndim == means.ndim else table[..., None] for table in others)]
+    return torch.cat(tables, -1).isfinite().all(-1, keepdim=True)
+
+
+def _write(table: Tensor, values: Tensor, finite: Tensor | None) -> None:
+    """Put values into a table, (..., N, K); with a mask, in rows of finite gradients, where the values are finite."""
+    table.copy_(values if finite is None else torch.where(finite & values.isfinite(), values, table))
 
 
 def _bounded(means: Tensor, cholesky: Tensor, size: tuple[int, int], min_sigma: float) -> tuple[Tensor, Tensor]:

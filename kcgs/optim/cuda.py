@@ -1,0 +1,204 @@
+"""The steps of `gaussian_adam.py` in one launch of Triton: a thread moves a Gaussian, float32, on a CUDA device.
+
+Numbers in between are float64, as in `loops.py`. A Gaussian with a gradient that is not finite stays as it is.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+# Gaussians of a program
+_ROWS = 128
+_OPTIONS = {"num_warps": 4, "enable_fp_fusion": True}
+
+
+class Adam(NamedTuple):
+    """Settings of a group, and the averages of its tables beside each other."""
+
+    lr: float | Tensor
+    beta1: float
+    beta2: float
+    eps: float
+    age: Tensor  # [N, 1]
+    average: Tensor  # [N, K]
+    square: Tensor  # [N, K]
+
+
+class Bounds(NamedTuple):
+    """Bounds of a step, in standard deviations and log scale, and of a field's geometry, in pixels."""
+
+    max_step: float
+    height: float
+    width: float
+    diagonal: float
+    min_sigma: float
+    min_factor: float
+    max_outside: float  # in standard deviations
+
+
+def step(tables: list[Tensor], gradients: list[Tensor | None], geometry: Adam, colors: Adam, bounds: Bounds) -> None:
+    """Move means, factors, colours and, if there are any, opacities; a table without a gradient stays.
+
+    Args:
+        tables: [..., N, 2], [..., N, 3], [..., N, C], and perhaps [..., N], contiguous.
+        gradients: of each table; None where it has none.
+        geometry: of the first two.
+        colors: of the others.
+        bounds: of the first two.
+    """
+    count, channels = tables[0].shape[:-1].numel(), tables[2].shape[-1]
+    has_gradient = [gradient is not None for gradient in gradients] + [False]
+    # where there is none any address will do: it is not read
+    addresses = [table if gradient is None else gradient for table, gradient in zip(tables, gradients, strict=True)]
+    opacities = tables[3:] or tables[:1]
+    with torch.cuda.device_of(tables[0]):
+        _step[(-(-count // _ROWS),)](
+            *tables[:3], *opacities, *addresses[:3], *(addresses[3:] or tables[:1]), *geometry, *colors, *bounds, count,
+            CHANNELS=channels, COLUMNS=channels + len(tables[3:]), MEANS=has_gradient[0], CHOLESKY=has_gradient[1],
+            COLORS=has_gradient[2], OPACITIES=has_gradient[3], LR_LOADED=isinstance(geometry.lr, Tensor),
+            COLOR_LR_LOADED=isinstance(colors.lr, Tensor), ROWS=_ROWS, **_OPTIONS,
+        )  # fmt: skip
+
+
+def _jit(function: Any) -> Any:
+    return triton.jit(function)
+
+
+@_jit
+def _gradient(gradients, place, mask, EXISTS: tl.constexpr):  # type: ignore[no-untyped-def]
+    if EXISTS:
+        return tl.load(gradients + place, mask=mask, other=0.0).to(tl.float64)
+    else:
+        return tl.zeros_like(place).to(tl.float64)
+
+
+@_jit
+def _rate(lr, beta1, beta2, age, LOADED: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Return the learning rate over the first average's correction, and the inverse root of the second one's."""
+    if LOADED:
+        lr = tl.load(lr)
+    zero = tl.zeros_like(age)
+    power1, power2 = tl.exp(tl.log(beta1 + zero) * age), tl.exp(tl.log(beta2 + zero) * age)
+    return lr / (1.0 - power1), 1.0 / tl.sqrt(1.0 - power2)
+
+
+@_jit
+def _move(gradient, averages, squares, place, mask, rate, root, beta1, beta2, eps):  # type: ignore[no-untyped-def]
+    """Update the averages of a column, and return Adam's step."""
+    average = tl.load(averages + place, mask=mask, other=0.0).to(tl.float64)
+    square = tl.load(squares + place, mask=mask, other=0.0).to(tl.float64)
+    average += (1.0 - beta1) * (gradient - average)
+    square = beta2 * square + (1.0 - beta2) * gradient * gradient
+    tl.store(averages + place, average.to(tl.float32), mask=mask)
+    tl.store(squares + place, square.to(tl.float32), mask=mask)
+    return -rate * average / (root * tl.sqrt(square) + eps)
+
+
+@_jit
+def _clamp(value, low, high):  # type: ignore[no-untyped-def]
+    return tl.where(value < low, low, tl.where(value > high, high, value))  # NaN stays NaN
+
+
+@_jit
+def _store(table, place, value, mask):  # type: ignore[no-untyped-def]
+    """Write numbers, but none that is not finite in float32."""
+    value = value.to(tl.float32)
+    tl.store(table + place, value, mask=mask & (tl.abs(value) < float("inf")))
+
+
+@_jit
+def _add(table, place, change, mask):  # type: ignore[no-untyped-def]
+    _store(table, place, tl.load(table + place, mask=mask, other=0.0) + change, mask)
+
+
+@_jit
+def _step(  # type: ignore[no-untyped-def]
+    means, cholesky, colors, opacities, means_gradient, cholesky_gradient, colors_gradient, opacities_gradient,
+    lr, beta1, beta2, eps, age, average, square,
+    color_lr, color_beta1, color_beta2, color_eps, color_age, color_average, color_square,
+    max_step, height, width, diagonal, min_sigma, min_factor, max_outside, count,
+    CHANNELS: tl.constexpr, COLUMNS: tl.constexpr, MEANS: tl.constexpr, CHOLESKY: tl.constexpr, COLORS: tl.constexpr,
+    OPACITIES: tl.constexpr, LR_LOADED: tl.constexpr, COLOR_LR_LOADED: tl.constexpr, ROWS: tl.constexpr,
+):  # fmt: skip
+    row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
+    mask = row < count
+    gx = _gradient(means_gradient, 2 * row, mask, MEANS)
+    gy = _gradient(means_gradient, 2 * row + 1, mask, MEANS)
+    g11 = _gradient(cholesky_gradient, 3 * row, mask, CHOLESKY)
+    g21 = _gradient(cholesky_gradient, 3 * row + 1, mask, CHOLESKY)
+    g22 = _gradient(cholesky_gradient, 3 * row + 2, mask, CHOLESKY)
+    largest = tl.abs(gx) + tl.abs(gy) + tl.abs(g11) + tl.abs(g21) + tl.abs(g22)
+    if COLORS:
+        for k in range(CHANNELS):
+            largest += tl.abs(_gradient(colors_gradient, row * CHANNELS + k, mask, COLORS))
+    largest += tl.abs(_gradient(opacities_gradient, row, mask, OPACITIES))
+    mask = mask & (largest < float("inf"))
+
+    if COLORS or OPACITIES:
+        years = tl.load(color_age + row, mask=mask, other=0.0) + 1.0
+        tl.store(color_age + row, years, mask=mask)
+        rate, root = _rate(color_lr, color_beta1, color_beta2, years.to(tl.float64), COLOR_LR_LOADED)
+        for k in range(COLUMNS):
+            is_color = mask & (k < CHANNELS)
+            gradient = _gradient(colors_gradient, row * CHANNELS + k, is_color, COLORS)
+            gradient += _gradient(opacities_gradient, row, mask & (k >= CHANNELS), OPACITIES)
+            change = _move(
+                gradient, color_average, color_square, row * COLUMNS + k, mask, rate, root,
+                color_beta1, color_beta2, color_eps,
+            )  # fmt: skip
+            if COLORS:
+                _add(colors, row * CHANNELS + k, change, is_color)
+            if OPACITIES:
+                _add(opacities, row, change, mask & (k >= CHANNELS))
+
+    if MEANS or CHOLESKY:
+        l11 = tl.load(cholesky + 3 * row, mask=mask, other=1.0).to(tl.float64)
+        l21 = tl.load(cholesky + 3 * row + 1, mask=mask, other=0.0).to(tl.float64)
+        l22 = tl.load(cholesky + 3 * row + 2, mask=mask, other=1.0).to(tl.float64)
+        years = tl.load(age + row, mask=mask, other=0.0) + 1.0
+        tl.store(age + row, years, mask=mask)
+        rate, root = _rate(lr, beta1, beta2, years.to(tl.float64), LR_LOADED)
+        place = 5 * row
+        d1 = _move(l11 * gx + l21 * gy, average, square, place, mask, rate, root, beta1, beta2, eps)
+        d2 = _move(l22 * gy, average, square, place + 1, mask, rate, root, beta1, beta2, eps)
+        k11 = _move(l11 * g11 + l21 * g21, average, square, place + 2, mask, rate, root, beta1, beta2, eps)
+        k21 = _move(l22 * g21, average, square, place + 3, mask, rate, root, beta1, beta2, eps)
+        k22 = _move(l22 * g22, average, square, place + 4, mask, rate, root, beta1, beta2, eps)
+        d1, d2 = _clamp(d1, -max_step, max_step), _clamp(d2, -max_step, max_step)
+        k11, k21 = _clamp(k11, -max_step, max_step), _clamp(k21, -max_step, max_step)
+        k22 = _clamp(k22, -max_step, max_step)
+        shift_x, shift_y = l11 * d1, l21 * d1 + l22 * d2
+
+        # L exp K, within bounds
+        e1, e2, gap = tl.exp(k11), tl.exp(k22), k11 - k22
+        is_small = tl.abs(gap) < 1e-4
+        mean = tl.where(is_small, 0.5 * (e1 + e2), (e1 - e2) / tl.where(is_small, 1.0, gap))
+        l21 = _clamp(l21 * e1 + l22 * k21 * mean, -diagonal, diagonal)
+        l11, l22 = _clamp(l11 * e1, min_factor, diagonal), _clamp(l22 * e2, min_factor, diagonal)
+        if MEANS:
+            outside_x, outside_y = max_outside * l11, max_outside * tl.sqrt(l21 * l21 + l22 * l22)
+            x = tl.load(means + 2 * row, mask=mask, other=0.0) + shift_x
+            y = tl.load(means + 2 * row + 1, mask=mask, other=0.0) + shift_y
+            _store(means, 2 * row, _clamp(x, -outside_x, width + outside_x), mask)
+            _store(means, 2 * row + 1, _clamp(y, -outside_y, height + outside_y), mask)
+        if CHOLESKY:
+            # see `frame.widen`
+            xx, xy, yy = l11 * l11, l11 * l21, l21 * l21 + l22 * l22
+            least = min_sigma * min_sigma
+            center, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
+            radius = tl.sqrt(half * half + xy * xy)
+            long = center + radius
+            short = l11 * l22 * (l11 * l22) / long
+            new_long, new_short = tl.maximum(long, least), tl.maximum(short, least)
+            isotropic, minor = new_long - long, (new_short - short) - (new_long - long)
+            divisor = tl.where(radius > 0.0, radius, 1.0)
+            w11 = tl.sqrt(xx + isotropic + 0.5 * minor * (1.0 - half / divisor))
+            is_thin = short < least
+            _store(cholesky, 3 * row, tl.where(is_thin, w11, l11), mask)
+            _store(cholesky, 3 * row + 1, tl.where(is_thin, (xy - 0.5 * minor * (xy / divisor)) / w11, l21), mask)
+            _store(cholesky, 3 * row + 2, tl.where(is_thin, tl.sqrt(new_long * new_short) / w11, l22), mask)

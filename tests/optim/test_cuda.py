@@ -1,0 +1,64 @@
+"""The kernel of GaussianAdam: that it compiles; its steps are in triton_steps.py, run in a process of their own.
+
+TRITON_INTERPRET is read when triton is imported, so it must not be set in the process of the other tests.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+STEPS = Path(__file__).with_name("triton_steps.py")
+
+pytestmark = pytest.mark.skipif(
+    importlib.util.find_spec("triton") is None, reason="Triton is not installed: pip install triton"
+)
+
+
+def test_steps() -> None:
+    environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"}
+    if not torch.cuda.is_available():
+        environment |= {"TRITON_INTERPRET": "1", "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(STEPS)]
+    root = STEPS.parent.parent.parent
+    done = subprocess.run(command, env=environment, cwd=root, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert " passed" in done.stdout and " skipped" not in done.stdout, done.stdout
+
+
+NUMBERS = {
+    *("beta1", "beta2", "eps", "color_beta1", "color_beta2", "color_eps"),
+    *("max_step", "height", "width", "diagonal", "min_sigma", "min_factor", "max_outside"),
+}
+
+
+@pytest.mark.skipif(os.environ.get("TRITON_INTERPRET") == "1", reason="the interpreter does not compile")
+@pytest.mark.parametrize("capability", [80, 90])
+@pytest.mark.parametrize(("opacities", "rate"), [(False, "fp32"), (True, "*fp32")])
+def test_compiles_without_a_gpu(
+    capability: int, opacities: bool, rate: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import triton
+    from triton.backends.compiler import GPUTarget
+
+    from kcgs.optim import cuda
+
+    monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
+    constants = {"CHANNELS": 3, "COLUMNS": 3 + opacities, "MEANS": True, "CHOLESKY": True, "COLORS": True}
+    constants |= {"OPACITIES": opacities, "LR_LOADED": rate == "*fp32", "COLOR_LR_LOADED": rate == "*fp32"}
+    constants["ROWS"] = cuda._ROWS
+    types = {**dict.fromkeys(NUMBERS, "fp32"), **dict.fromkeys(("lr", "color_lr"), rate), "count": "i32"}
+    types |= dict.fromkeys(constants, "constexpr")
+    signature = {name: types.get(name, "*fp32") for name in cuda._step.arg_names}
+    source = triton.compiler.ASTSource(cuda._step, signature, constants)
+    ptx = triton.compile(source, target=GPUTarget("cuda", capability, 32), options=cuda._OPTIONS).asm["ptx"]
+    assert "sqrt.rn.f64" in ptx
+    # no Gaussian knows of another
+    assert not re.search(r"\b(atom|red|shfl|bar)\.", ptx)

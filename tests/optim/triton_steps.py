@@ -1,0 +1,121 @@
+"""Steps that test_cuda.py takes in a process of its own: on a GPU, or with TRITON_INTERPRET=1 in numpy."""
+
+from __future__ import annotations
+
+import copy
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from kcgs import GaussianField
+from kcgs.optim import GaussianAdam, gaussian_adam
+
+DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+SIZE = (24, 36)
+
+
+@pytest.fixture(autouse=True)
+def launches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Take the steps of float32 tables by the kernel, and none of a gradient that is not finite; count launches."""
+    counts, launch = [], gaussian_adam._launch
+
+    def counted_launch(*arguments: object) -> None:
+        counts.append(1)
+        launch(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(gaussian_adam, "_launch", counted_launch)
+    monkeypatch.setattr(gaussian_adam, "_raises", lambda parameter: False)
+    if DEVICE.type == "cpu":
+        is_launched = lambda *tensors: all(t.dtype is torch.float32 for t in tensors)  # noqa: E731
+        monkeypatch.setattr(gaussian_adam, "_is_launched", is_launched)
+    return counts
+
+
+def field_of(kind: str, num_gaussians: int = 20) -> GaussianField:
+    channels = 5 if kind == "channels" else 3
+    field = GaussianField.random(num_gaussians, SIZE, channels=channels, seed=1)
+    tensors = [field.means.detach(), field.cholesky.detach(), field.colors.detach()]
+    if kind == "batch":
+        tensors = [torch.stack([tensor, 0.9 * tensor]) for tensor in tensors]
+    opacities = torch.full((num_gaussians,), 0.7) if kind == "opacities" else None
+    field = GaussianField(*tensors, None, opacities, size=SIZE)
+    if kind == "frozen":
+        field.cholesky.requires_grad_(False)
+        field.means.data[0] = -300.0
+    return field.to(DEVICE)
+
+
+def give_gradients(generator: torch.Generator, *fields: GaussianField) -> None:
+    """Give the same random gradients to all fields, each in its own precision."""
+    for parameters in zip(*(field.parameters() for field in fields), strict=True):
+        gradient = torch.randn(parameters[0].shape, generator=generator).to(DEVICE)
+        for parameter in parameters:
+            parameter.grad = gradient.to(parameter, copy=True) if parameter.requires_grad else None
+
+
+def states(optimizer: GaussianAdam) -> list[Tensor]:
+    return [values for state in optimizer.state.values() for values in state.values()]
+
+
+@pytest.mark.parametrize("kind", ["plain", "channels", "opacities", "batch", "frozen"])
+def test_takes_the_steps_of_torch_operations(kind: str, launches: list[int]) -> None:
+    """In float32 and in float64, of rows that are of two ages, reach the bounds, and have NaN at times."""
+    field, generator = field_of(kind), torch.Generator().manual_seed(2)
+    twin = copy.deepcopy(field).double()
+    optimizers = [GaussianAdam(each, 0.5, min_sigma=2.0) for each in (field, twin)]
+    for step in range(6):
+        if step == 3:
+            for each, optimizer in zip((field, twin), optimizers, strict=True):
+                optimizer.append(each, copy.deepcopy(each))
+        give_gradients(generator, field, twin)
+        rows = [0, 7, 19]
+        for each in (field, twin):
+            assert each.means.grad is not None and each.colors.grad is not None
+            each.means.grad[..., rows[0], 1] = math.nan
+            each.colors.grad[..., rows[1], 2] = math.inf
+            each.colors.grad[..., rows[2], 0] = -math.inf
+        before = copy.deepcopy([*field.parameters()])
+        for optimizer in optimizers:
+            optimizer.step()
+        for value, old in zip(field.parameters(), before, strict=True):
+            stays = (value == old).all(-1) if value.ndim == field.means.ndim else value == old
+            assert stays[..., rows].all() and bool(stays.all()) != value.requires_grad
+    assert len(launches) == 6
+    for value, expected in zip(field.parameters(), twin.parameters(), strict=True):
+        torch.testing.assert_close(value, expected, rtol=1e-5, atol=2e-5, check_dtype=False)
+    for value, expected in zip(*map(states, optimizers), strict=True):
+        torch.testing.assert_close(value, expected, rtol=1e-5, atol=1e-6, check_dtype=False)
+
+
+def test_a_step_whose_gradients_are_nan_changes_nothing(launches: list[int]) -> None:
+    field = field_of("plain")
+    optimizer = GaussianAdam(field)
+    give_gradients(torch.Generator().manual_seed(2), field)
+    optimizer.step()
+    before = copy.deepcopy([*field.parameters(), *states(optimizer)])
+    for parameter in field.parameters():
+        parameter.grad = torch.full_like(parameter, math.nan)
+    optimizer.step()
+    assert len(launches) == 2
+    assert all(torch.equal(a, b) for a, b in zip(before, [*field.parameters(), *states(optimizer)], strict=True))
+
+
+@pytest.mark.filterwarnings("ignore:overflow")  # numpy's, in the interpreter
+def test_rates_that_overflow_leave_numbers_finite() -> None:
+    field, generator = field_of("plain"), torch.Generator().manual_seed(2)
+    optimizer = GaussianAdam(field, 1e38, color_lr=3e38)
+    for _ in range(4):
+        give_gradients(generator, field)
+        optimizer.step()
+    assert all(parameter.isfinite().all() for parameter in field.parameters())
+
+
+def test_a_rate_on_the_device() -> None:
+    """A captured graph reads it anew at each replay."""
+    fields = [field_of("plain"), field_of("plain")]
+    for field, rate in zip(fields, [0.25, torch.tensor(0.25, device=DEVICE)], strict=True):
+        give_gradients(torch.Generator().manual_seed(2), field)
+        GaussianAdam(field, rate).step()
+    assert torch.equal(fields[0].means, fields[1].means)
