@@ -18,6 +18,7 @@ from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
 from .initial import initial_sigma
+from .log import take_up
 from .optimizers import make_optimizer
 from .problem import Problem
 from .result import HistoryEntry
@@ -46,6 +47,7 @@ class Checkpoint:
     def write(self, state: FitState, seconds: float) -> None:
         """Put the state, and the seconds of the fit so far, in the file's place."""
         start = time.perf_counter()
+        take_up(state, wait=True)
         buffer = io.BytesIO()
         torch.save({"problem": _fingerprint(self.problem), "seconds": seconds, **_to_plain(state)}, buffer)
         content = buffer.getvalue()

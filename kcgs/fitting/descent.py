@@ -10,6 +10,7 @@ from kcgs.functional.splat import squared_error_gradients
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
+from .readback import Readback
 from .state import FitState
 
 # weight of 1 - SSIM beside the mean absolute error, as in Image-GS
@@ -18,6 +19,8 @@ _SSIM_WEIGHT = 0.1
 DRAFT_CUTOFF = 1e-3
 # numbers beyond it are near overflow
 _LARGEST = 1e15
+# where the host runs ahead of a device; more of them let it run farther
+_ITERATIONS_PER_CHECK = 10
 
 
 def render(state: FitState, scene: Scene | None = None) -> Tensor:
@@ -46,7 +49,9 @@ def backward(state: FitState, rendered: Tensor | None) -> None:
     """
     problem, field = state.problem, state.scene.field
     config, image = problem.config, problem.image
-    if rendered is None and config.loss == "l2" and problem.objective is None and problem.bounds is None:
+    # of a step that waits for nothing all gradients are NaN where the device had too little room
+    can_miss = image.is_cpu or state.runs_ahead
+    if rendered is None and can_miss and config.loss == "l2" and problem.objective is None and problem.bounds is None:
         field.means.grad, field.cholesky.grad, field.colors.grad = squared_error_gradients(
             image, field.means, field.cholesky, field.colors, field.region_ids, state.scene.regions,
             cutoff=state.cutoff, backend=config.backend,
@@ -66,10 +71,31 @@ def backward(state: FitState, rendered: Tensor | None) -> None:
     rendered.backward(sign)
 
 
+def has_diverged(state: FitState) -> bool:
+    """True where a number is not finite, or near overflow; where the host runs ahead, some iterations ago.
+
+    There it waits, every ten iterations, for what the device did ten iterations before: so it is never twenty ahead.
+    """
+    if not state.runs_ahead:
+        return not is_finite(state.scene.field)
+    if state.iteration % _ITERATIONS_PER_CHECK:
+        return False
+    previous, state.magnitude = state.magnitude, Readback(_magnitude(state.scene.field))
+    return previous is not None and not all(number < _LARGEST for number in previous.numbers())
+
+
 def is_finite(field: GaussianField) -> bool:
     """True where every number is finite, and far from overflow."""
+    if not field.means.is_cpu:
+        return bool((_magnitude(field) < _LARGEST).all())
     from kcgs.optim.loops import is_within  # loads numba
 
     tensors = field.means, field.cholesky, field.colors
     # compiled: between renders, whose data fill the caches, an operation of torch takes thirty microseconds
-    return all(is_within(tensor.detach().cpu().numpy().ravel(), _LARGEST) for tensor in tensors)
+    return all(is_within(tensor.detach().numpy().ravel(), _LARGEST) for tensor in tensors)
+
+
+@torch.no_grad()
+def _magnitude(field: GaussianField) -> Tensor:
+    """Return the largest absolute number of each column of a field, (5 + C,); a NaN is the largest."""
+    return torch.cat([field.means, field.cholesky, field.colors], -1).abs().amax(0)

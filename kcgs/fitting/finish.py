@@ -7,7 +7,7 @@ import torch
 from kcgs.pruning import prune
 
 from .descent import is_finite, render
-from .log import log
+from .log import log, take_up
 from .region_report import report_regions
 from .removal import remove_gaussians
 from .result import FitResult, StopReason
@@ -18,6 +18,7 @@ from .strategies import EndDrafts
 def finish(state: FitState, reason: StopReason, seconds: float) -> FitResult:
     """Measure the last scene, take the best, and prune it; return a fit that ended for a reason."""
     problem, config = state.problem, state.problem.config
+    take_up(state, wait=True)
     best_draft = None if state.cutoff == config.cutoff else state.best
     EndDrafts().apply(state)
     with torch.no_grad():
@@ -26,6 +27,7 @@ def finish(state: FitState, reason: StopReason, seconds: float) -> FitResult:
         if reason != "diverged" and is_finite(state.scene.field):
             remove_gaussians(state, state.num_gaussians - problem.num_gaussians)
             log(state, render(state), seconds)
+    take_up(state, wait=True)
     assert state.best is not None
     scene, num_pruned, prune_error = state.best, 0, 0.0
     if config.prune > 0:

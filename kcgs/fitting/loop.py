@@ -18,9 +18,9 @@ from kcgs.kernels import prepare, threads_for_kernels
 from .checkpoint import Checkpoint
 from .clock import Clock
 from .config import FitConfig
-from .descent import backward, is_finite, render
+from .descent import backward, has_diverged, render
 from .finish import finish
-from .log import log, log_is_due
+from .log import log, log_is_due, take_up
 from .optimizers import set_learning_rates
 from .problem import Problem, make_problem
 from .result import FitResult, HistoryEntry, StopReason
@@ -100,9 +100,9 @@ def fit(
 
 
 @lru_cache(maxsize=64)
-def precompile(config: FitConfig) -> None:
+def precompile(config: FitConfig, device: torch.device | str = "cpu") -> None:
     """Compile and load what fits of these settings need, so that no clock counts it; with `max_seconds`, `fit` does."""
-    ramp = torch.linspace(0.0, 1.0, 96)
+    ramp = torch.linspace(0.0, 1.0, 96, device=device)
     image = torch.stack([ramp.expand(64, 96), 1 - ramp.expand(64, 96), (8 * ramp).sin().square().expand(64, 96)])
     labels = (ramp > 0.6).long().expand(64, 96).contiguous()
     iterations = min(config.usual_iterations, 20)
@@ -119,7 +119,7 @@ def fit_problem(
 ) -> FitResult:
     """Solve a problem whose arguments are checked: see `fit`, which brings autograd's modes."""
     if problem.config.max_seconds is not None:
-        precompile(problem.config)
+        precompile(problem.config, problem.image.device)
     prepare(problem.config.backend, problem.image.device, problem.image.dtype, len(problem.image))
     _warn_of_regions(problem)
     searches = problem.config.target_psnr is not None
@@ -144,23 +144,27 @@ def _run(
     reason: StopReason = "iterations"
     while state.iteration < limit:
         state.progress = max(state.iteration / limit, clock.seconds() / max_seconds)
-        if not is_finite(state.scene.field):
+        if has_diverged(state):
             warn_user(f"the fit diverged at iteration {state.iteration}: the best so far is kept")
             reason = "diverged"
             break
+        rendered, has_changed = None, False
         for strategy in strategies:
             if strategy.due(state):
                 strategy.apply(state)
-        rendered = None
+                has_changed = True
         if log_is_due(state, clock.seconds()):
             rendered = render(state)
             log(state, rendered, clock.seconds())
+        elif has_changed and state.runs_ahead:
+            rendered = render(state)  # this waits, and learns how much room the next steps need
         backward(state, rendered)
         set_learning_rates(state.optimizer, config, state.progress)
         state.optimizer.step()
         state.optimizer.zero_grad()
         state.iteration += 1
 
+        take_up(state, wait=False)
         entry = state.history[-1]
         bar.update(state.progress, f"iteration {state.iteration}, {entry.num_gaussians} Gaussians, {entry.psnr:.2f} dB")
         if store is not None and (store.due() or state.iteration == limit):

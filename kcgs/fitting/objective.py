@@ -97,10 +97,15 @@ class MsSsimObjective:
 
     def value(self, difference: Tensor) -> float:
         """Return E, as a mean over pixels and channels."""
-        squared = self._squared * float(difference.square().mean())
+        return float(self.value_on_device(difference))
+
+    def value_on_device(self, difference: Tensor) -> Tensor:
+        """Return E as a tensor, float64, on the device of the difference."""
         if self._passes is None:
-            return float(self._measure(difference)[0]) / difference[0].numel() + squared
-        return self._passes.value(difference.contiguous().numpy()) / difference[0].numel() + squared
+            total = self._measure(difference)[0].double()
+        else:
+            total = torch.tensor(self._passes.value(difference.contiguous().numpy()), dtype=torch.float64)
+        return total / difference[0].numel() + self._squared * difference.square().mean().double()
 
     def weigh(self, means: Tensor, cholesky: Tensor) -> Tensor:
         """Return about what the squared error of Gaussians counts in E, by their places and sizes, (N,)."""

@@ -60,7 +60,7 @@ class Problem:
     def band(self) -> Tensor:
         """Rows and columns (M, 2) of the pixels near a contour of the user's map, for EF-PSNR."""
         if self.regions is None:
-            return torch.empty(0, 2, dtype=torch.int64)
+            return torch.empty(0, 2, dtype=torch.int64, device=self.image.device)
         return edge_band(self.regions.labels).nonzero().contiguous()
 
     @property

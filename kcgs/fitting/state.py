@@ -4,13 +4,25 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from kcgs.functional import RegionMap
+from kcgs.optim import GaussianAdam
 from kcgs.scene import Scene
 
 from .optimizers import GaussianOptimizer
 from .problem import Problem
+from .readback import Readback
 from .result import HistoryEntry
+
+
+class Measurement(NamedTuple):
+    """A scene that was measured, until its errors have arrived from the device."""
+
+    iteration: int
+    seconds: float
+    scene: Scene  # a copy
+    errors: Readback
 
 
 @dataclass
@@ -40,6 +52,10 @@ class FitState:
     num_late_moves: int = 0
     """How often contours moved after densification."""
     history: list[HistoryEntry] = field(default_factory=list)
+    pending: list[Measurement] = field(default_factory=list)
+    """Measurements whose errors are not in the history yet."""
+    magnitude: Readback | None = None
+    """The largest absolute numbers of the field some iterations ago, where the host runs ahead."""
     best: Scene | None = None
     """A copy of the best scene that was measured."""
     best_score: float = -math.inf
@@ -49,6 +65,14 @@ class FitState:
     def num_gaussians(self) -> int:
         """Gaussians at the moment."""
         return self.scene.num_gaussians
+
+    @property
+    def runs_ahead(self) -> bool:
+        """True where a step waits for nothing, so that the host is some iterations before the device.
+
+        Optimizers of published methods would keep a gradient that is not finite in their averages.
+        """
+        return not self.problem.image.is_cpu and isinstance(self.optimizer, GaussianAdam)
 
     @property
     def expected_iterations(self) -> float:

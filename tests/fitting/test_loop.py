@@ -214,7 +214,7 @@ class TestStopping:
         assert 0.4 < result.history[-1].seconds < 0.6
 
     def test_compilation_takes_none_of_the_time(self, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("kcgs.fitting.loop.precompile", lambda config: clock.advance(100.0))
+        monkeypatch.setattr("kcgs.fitting.loop.precompile", lambda config, device: clock.advance(100.0))
         result = fit(*disc(), 12, recipe=quick(iterations=10**7, max_seconds=0.5))
         assert clock.seconds > 100 and result.seconds < 1
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from kcgs.fitting.log import take_up
 from kcgs.fitting.state import FitState
 
 
@@ -22,4 +23,5 @@ class EndDrafts:
     def apply(self, state: FitState) -> None:
         """Set the cutoff; the next state that is measured is the best, since drafts do not compare with it."""
         if state.cutoff != state.problem.config.cutoff:
+            take_up(state, wait=True)
             state.cutoff, state.best_score = state.problem.config.cutoff, -math.inf

@@ -1,0 +1,30 @@
+"""Numbers that come from a device while it works on."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+class Readback:
+    """A small tensor on its way to the host, where nobody waits for it; one on the CPU is there at once."""
+
+    def __init__(self, numbers: Tensor) -> None:
+        # from CUDA into pinned memory, after what the device has to do before
+        self._numbers = numbers.detach().to("cpu", non_blocking=numbers.is_cuda)
+        self._copied: torch.cuda.Event | None = None
+        if numbers.is_cuda:
+            with torch.cuda.device_of(numbers):
+                self._copied = torch.cuda.Event()
+                self._copied.record()
+
+    def has_arrived(self) -> bool:
+        """True once `numbers` need not wait."""
+        return self._copied is None or self._copied.query()
+
+    def numbers(self) -> list[float]:
+        """Return the numbers, and wait for them where they have not arrived."""
+        if self._copied is not None:
+            self._copied.synchronize()
+        values: list[float] = self._numbers.tolist()
+        return values
