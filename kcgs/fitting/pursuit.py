@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
+from kcgs._triton import takes_triton
 from kcgs.functional import RegionMap, lookup_regions, region_splat
 from kcgs.functional.blur import gaussian_taps
 from kcgs.kernels import threads_for_torch
 from kcgs.nn import GaussianField
-from kcgs.nn.field import join
 
 # Standard deviations that are tried, in pixels, by the side of the blocks that the residual is averaged over for them.
 # More of them, and smaller blocks, cost time, and descent changes them anyway.
@@ -48,11 +48,12 @@ def propose(residual: Tensor, regions: RegionMap | None, count: int, *, backend:
     residual = residual.detach()
     # below this the gain is rounding error: one pixel's, at the precision of the largest
     floor = (128 * torch.finfo(residual.dtype).eps * float(residual.abs().max())) ** 2
-    size, ids = (residual.shape[1], residual.shape[2]), None if regions is None else regions.ids[:0]
-    empty = [residual.new_zeros(0, columns) for columns in (2, 3, len(residual))]
-    field = GaussianField(empty[0], empty[1], empty[2], ids, size=size)
+    size = residual.shape[1], residual.shape[2]
+    parts = [[residual.new_zeros(0, columns) for columns in (2, 3, len(residual))]]
+    region_ids = [] if regions is None else [regions.ids[:0]]
+    missing = count
     with torch.no_grad():
-        while (missing := count - field.num_gaussians) > 0:
+        while missing > 0:
             with threads_for_torch():
                 gain, means, sigma, colors = _local_maxima(residual, regions, floor)
             if not len(gain):
@@ -66,9 +67,11 @@ def propose(residual: Tensor, regions: RegionMap | None, count: int, *, backend:
             length = (rendered * residual).sum() / rendered.square().sum()
             if not bool(length > 0):
                 break
-            field = join(field, GaussianField(means, cholesky, colors * length, ids, size=size))
-            residual = residual - rendered * length
-    return field
+            parts.append([means, cholesky, colors * length])
+            region_ids += [] if ids is None else [ids]
+            residual, missing = residual - rendered * length, missing - len(means)
+    means, cholesky, colors = (torch.cat(rows) for rows in zip(*parts, strict=True))
+    return GaussianField(means, cholesky, colors, torch.cat(region_ids) if region_ids else None, size=size)
 
 
 def _local_maxima(residual: Tensor, regions: RegionMap | None, floor: float) -> tuple[Tensor, ...]:
@@ -106,10 +109,7 @@ def _scales(residual: Tensor, labels: Tensor | None) -> Iterator[_Scale]:
             planes = residual[:, :height, :width] * mask
         planes = torch.cat([_average(planes, block), _average(mask, block)])
         for sigma in sigmas:
-            deviation, reach = sigma / block, math.ceil(_REACH * sigma / block)
-            # the square of a Gaussian is one, too, narrower by sqrt 2
-            windows = gaussian_taps(deviation, reach), gaussian_taps(deviation / math.sqrt(2.0), reach)
-            products, norm = _blur(planes, middle_labels, *windows)
+            products, norm = _blur(planes, middle_labels, sigma / block)
             colors = products / norm
             yield _Scale(sigma, block, (products * colors).sum(0) * block**2, colors)
 
@@ -135,18 +135,27 @@ def _average(planes: Tensor, block: int) -> Tensor:
     return planes if block == 1 else _average(halve(planes), block // 2)
 
 
-def _blur(planes: Tensor, labels: Tensor | None, taps: list[float], norm_taps: list[float]) -> tuple[Tensor, Tensor]:
+def _blur(planes: Tensor, labels: Tensor | None, sigma: float) -> tuple[Tensor, Tensor]:
     """Filter planes along columns, then along rows, each time over the pixels of the same label alone.
 
-    So a pixel sees those of its region that it reaches by a column and a row. `norm_taps` are for the last plane.
+    So a pixel sees those of its region that it reaches by a column and a row. The last plane is filtered by the square
+    of the filter.
 
     Returns:
         The other planes, and the last.
     """
+    # the square of a Gaussian is one, too, narrower by sqrt 2
+    reach, norm_sigma = math.ceil(_REACH * sigma), sigma / math.sqrt(2.0)
+    if takes_triton(planes):
+        from .cuda import blur  # loads triton
+
+        planes = blur(planes, None if labels is None else labels.contiguous(), sigma, norm_sigma, reach)
+        return planes[:-1], planes[-1]
+    taps, norm_taps, is_same = gaussian_taps(sigma, reach), gaussian_taps(norm_sigma, reach), planes.new_ones(())
     for dim in (1, 2):
         blurred, length = planes.clone(), planes.shape[dim]
         for distance in range(1, min(len(taps), length)):
-            count, is_same = length - distance, planes.new_ones(())
+            count = length - distance
             if labels is not None:
                 before, after = (labels.narrow(dim - 1, start, count) for start in (0, distance))
                 is_same = torch.eq(before, after, out=torch.empty_like(before))  # as floats: masks need no conversion
@@ -159,7 +168,10 @@ def _blur(planes: Tensor, labels: Tensor | None, taps: list[float], norm_taps: l
 
 
 def _pool(plane: Tensor, radius: int) -> Tensor:
-    """Return the largest value of each square of side 2 radius + 1; torch's pooling takes six times as long."""
+    """Return the largest value of each square of side 2 radius + 1."""
+    if not plane.is_cpu:
+        return max_pool2d(plane[None], 2 * radius + 1, 1, radius)[0]
+    # torch's pooling takes six times as long
     plane = pad(plane, [radius] * 4)
     for dim in (0, 1):
         length = plane.shape[dim] - 2 * radius

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable, Iterable, Iterator
-from importlib.util import find_spec
 from typing import Any
 
 import torch
@@ -15,6 +13,7 @@ from torch.nn.functional import pad
 from torch.optim import Optimizer
 
 from kcgs._check import check_number, verify
+from kcgs._triton import takes_triton
 from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.nn import GaussianField
 
@@ -123,8 +122,7 @@ class GaussianAdam(Optimizer):
         for group in groups:
             _begin(self.state[group["params"][0]], group)
         parameters = geometry["params"] + colors["params"]
-        averages = [average for group in groups for average in self.state[group["params"][0]].values()]
-        if _is_launched(*parameters, *averages):
+        if takes_triton(*parameters):
             _launch(self.state, geometry, colors)
             return
         finite = None if _raises(parameters[0]) else _finite_rows(parameters)
@@ -276,20 +274,6 @@ def _has_gradient(group: dict[str, Any]) -> bool:
 def _raises(parameter: Tensor) -> bool:
     """True where gradients that are not finite are an error: reading values of a device would wait for it."""
     return parameter.is_cpu
-
-
-@functools.cache
-def _has_triton() -> bool:
-    return find_spec("triton") is not None
-
-
-def _is_launched(*tensors: Tensor) -> bool:
-    """True where the kernel of Triton may read and change the memory of tensors."""
-    return (
-        not torch.compiler.is_compiling()
-        and all(t.dtype is torch.float32 and t.is_cuda and t.is_contiguous() for t in tensors)
-        and _has_triton()
-    )
 
 
 def _is_compiled(*tensors: Tensor) -> bool:

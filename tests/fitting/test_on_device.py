@@ -170,7 +170,7 @@ def test_a_step_reads_no_value_and_takes_few_operations(ahead: pytest.MonkeyPatc
     counter, steps, checked = Counter(), [], set()
     for owner, name in ((descent, "squared_error_gradients"), (gaussian_adam, "_launch")):
         ahead.setattr(owner, name, counter.paused(getattr(owner, name), name))
-    ahead.setattr(gaussian_adam, "_is_launched", lambda *tensors: True)
+    ahead.setattr(gaussian_adam, "takes_triton", lambda *tensors: True)
     ahead.setattr(gaussian_adam, "_launch", lambda *arguments: counter.operations.append("_launch"))
     for owner, name in ((Readback, "numbers"), (Densify, "apply"), (EndDrafts, "apply"), (Tensor, "backward")):
         ahead.setattr(owner, name, counter.paused(getattr(owner, name)))

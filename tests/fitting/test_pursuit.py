@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.util
+import os
+import subprocess
+import sys
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -196,3 +201,36 @@ def test_a_small_region_does_not_stay_black() -> None:
         image[:, row, column : column + k] = 0.3 * k
     scene = fit(image, labels, 30, iterations=120).scene
     assert (scene.render() - image).abs()[:, labels > 0].max() < 0.1
+
+
+@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed: pip install triton")
+class TestTriton:
+    """TRITON_INTERPRET is read when triton is imported, so it must not be set in the process of the other tests."""
+
+    def test_filters_as_torch_operations(self) -> None:
+        environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"}
+        if not torch.cuda.is_available():
+            environment |= {"TRITON_INTERPRET": "1", "OMP_NUM_THREADS": "1"}
+        file = Path(__file__).with_name("triton_filters.py")
+        command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(file)]
+        done = subprocess.run(command, env=environment, cwd=file.parents[2], capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert " passed" in done.stdout and " skipped" not in done.stdout, done.stdout
+
+    @pytest.mark.parametrize("capability", [80, 90])
+    @pytest.mark.parametrize("has_labels", [False, True])
+    def test_compiles_without_a_gpu(
+        self, capability: int, has_labels: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        import triton
+        from triton.backends.compiler import GPUTarget
+
+        from kcgs.fitting import cuda
+
+        monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
+        constants = {"REACH": 4, "MAPPED": has_labels, "PIXELS": cuda._PIXELS}
+        types = {**dict.fromkeys(constants, "constexpr"), **dict.fromkeys(("area", "stride", "length"), "i32")}
+        types |= dict.fromkeys(("exponent", "norm_exponent"), "fp32")
+        signature = {name: types.get(name, "*fp32") for name in cuda._blur.arg_names}
+        source = triton.compiler.ASTSource(cuda._blur, signature, constants)
+        triton.compile(source, target=GPUTarget("cuda", capability, 32), options=cuda._OPTIONS)

@@ -28,8 +28,8 @@ def launches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     monkeypatch.setattr(gaussian_adam, "_launch", counted_launch)
     monkeypatch.setattr(gaussian_adam, "_raises", lambda parameter: False)
     if DEVICE.type == "cpu":
-        is_launched = lambda *tensors: all(t.dtype is torch.float32 for t in tensors)  # noqa: E731
-        monkeypatch.setattr(gaussian_adam, "_is_launched", is_launched)
+        takes_triton = lambda *tensors: all(t.dtype is torch.float32 for t in tensors)  # noqa: E731
+        monkeypatch.setattr(gaussian_adam, "takes_triton", takes_triton)
     return counts
 
 
