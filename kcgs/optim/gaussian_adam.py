@@ -362,6 +362,10 @@ def _bounded(means: Tensor, cholesky: Tensor, size: tuple[int, int], min_sigma: 
     l11, l21, l22 = cholesky.unbind(-1)
     l11, l22 = l11.clamp(_MIN_FACTOR, diagonal), l22.clamp(_MIN_FACTOR, diagonal)
     l21 = l21.clamp(-diagonal, diagonal)
-    outside = _MAX_OUTSIDE * torch.stack([l11, torch.hypot(l21, l22)], -1)
-    means = torch.minimum(torch.maximum(means, -outside), means.new_tensor([width, height]) + outside)
-    return means, widen(torch.stack([l11, l21, l22], -1), min_sigma)
+    # no tensor of the size: it would be copied to a device, and waited for
+    reaches, lengths = (_MAX_OUTSIDE * l11, _MAX_OUTSIDE * torch.hypot(l21, l22)), (width, height)
+    places = [
+        torch.minimum(torch.maximum(place, -reach), reach + length)
+        for place, reach, length in zip(means.unbind(-1), reaches, lengths, strict=True)
+    ]
+    return torch.stack(places, -1), widen(torch.stack([l11, l21, l22], -1), min_sigma)
