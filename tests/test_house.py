@@ -32,7 +32,7 @@ LAYERS = [
     {"kernels", "engine", "plots"},
     {"maps"},
     {"_image", "_labels"},
-    {"_atomic", "_check", "_decode", "_memory", "_progress", "_repr", "_suffixes", "_triton", "_warn"},
+    {"_atomic", "_check", "_decode", "_memory", "_progress", "_repr", "_suffixes", "_warn"},
     {"errors", "_rows"},
 ]
 # what to say: what not to

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from kcgs.functional import RegionMap, region_splat, ssim
 from kcgs.functional.splat import squared_error_gradients
+from kcgs.kernels import settle
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
@@ -49,9 +53,8 @@ def backward(state: FitState, rendered: Tensor | None) -> None:
     """
     problem, field = state.problem, state.scene.field
     config, image = problem.config, problem.image
-    # of a step that waits for nothing all gradients are NaN where the device had too little room
-    can_miss = image.is_cpu or state.runs_ahead
-    if rendered is None and can_miss and config.loss == "l2" and problem.objective is None and problem.bounds is None:
+    state.optimizer.zero_grad()
+    if rendered is None and config.loss == "l2" and problem.objective is None and problem.bounds is None:
         field.means.grad, field.cholesky.grad, field.colors.grad = squared_error_gradients(
             image, field.means, field.cholesky, field.colors, field.region_ids, state.scene.regions,
             cutoff=state.cutoff, backend=config.backend,
@@ -75,27 +78,36 @@ def has_diverged(state: FitState) -> bool:
     """True where a number is not finite, or near overflow; where the host runs ahead, some iterations ago.
 
     There it waits, every ten iterations, for what the device did ten iterations before: so it is never twenty ahead.
+    Where a step had gradients of NaN, since its lists did not fit, it makes room for those of the next.
     """
+    field = state.scene.field
     if not state.runs_ahead:
-        return not is_finite(state.scene.field)
+        return not is_finite(field)
     if state.iteration % _ITERATIONS_PER_CHECK:
         return False
-    previous, state.magnitude = state.magnitude, Readback(_magnitude(state.scene.field))
-    return previous is not None and not all(number < _LARGEST for number in previous.numbers())
+    tables = field.means, field.cholesky, field.colors
+    gradients = [table.grad for table in tables if table.grad is not None]
+    previous, state.magnitudes = state.magnitudes, Readback(_magnitudes([*tables, *gradients]))
+    if previous is None:
+        return False
+    numbers, columns = previous.numbers(), sum(table.shape[1] for table in tables)
+    if any(map(math.isnan, numbers[columns:])):
+        settle(state.problem.image.device, state.problem.size)
+    return not all(number < _LARGEST for number in numbers[:columns])
 
 
 def is_finite(field: GaussianField) -> bool:
     """True where every number is finite, and far from overflow."""
+    tables = field.means, field.cholesky, field.colors
     if not field.means.is_cpu:
-        return bool((_magnitude(field) < _LARGEST).all())
+        return bool((_magnitudes(tables) < _LARGEST).all())
     from kcgs.optim.loops import is_within  # loads numba
 
-    tensors = field.means, field.cholesky, field.colors
     # compiled: between renders, whose data fill the caches, an operation of torch takes thirty microseconds
-    return all(is_within(tensor.detach().numpy().ravel(), _LARGEST) for tensor in tensors)
+    return all(is_within(table.detach().numpy().ravel(), _LARGEST) for table in tables)
 
 
 @torch.no_grad()
-def _magnitude(field: GaussianField) -> Tensor:
-    """Return the largest absolute number of each column of a field, (5 + C,); a NaN is the largest."""
-    return torch.cat([field.means, field.cholesky, field.colors], -1).abs().amax(0)
+def _magnitudes(tables: Sequence[Tensor]) -> Tensor:
+    """Return the largest absolute number of each column of tables, (N, K) each; a NaN is the largest."""
+    return torch.cat([*tables], -1).abs().amax(0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from kcgs.kernels import settle
 from kcgs.pruning import prune
 
 from .descent import is_finite, render
@@ -19,6 +20,7 @@ def finish(state: FitState, reason: StopReason, seconds: float) -> FitResult:
     """Measure the last scene, take the best, and prune it; return a fit that ended for a reason."""
     problem, config = state.problem, state.problem.config
     take_up(state, wait=True)
+    settle(problem.image.device, problem.size)
     best_draft = None if state.cutoff == config.cutoff else state.best
     EndDrafts().apply(state)
     with torch.no_grad():

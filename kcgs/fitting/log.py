@@ -32,7 +32,10 @@ def log_is_due(state: FitState, seconds: float) -> bool:
 
 
 def log(state: FitState, rendered: Tensor, seconds: float, scene: Scene | None = None) -> None:
-    """Measure a render of the state's scene, or of another; the first measurement of a fit is waited for."""
+    """Measure a render of the state's scene, or of another; the first measurement of a fit is waited for.
+
+    A render of NaN, of a step that the device had no room for, is as if it were not measured.
+    """
     scene = scene or state.scene
     errors = Readback((_errors_on_cpu if rendered.is_cpu else _errors_on_device)(state.problem, rendered.detach()))
     # of the Gaussians as they are now, since only the errors say whether they are the best
@@ -46,6 +49,8 @@ def take_up(state: FitState, *, wait: bool) -> None:
     while state.pending and (wait or state.pending[0].errors.has_arrived()):
         iteration, seconds, scene, errors = state.pending.pop(0)
         loss, error, band_error, score_error = errors.numbers()
+        if math.isnan(loss):
+            continue
         psnr, ef_psnr, score = map(_decibel, (error, band_error, score_error))
         state.history.append(HistoryEntry(iteration, seconds, loss, psnr, ef_psnr, scene.num_gaussians))
         if score > state.best_score:

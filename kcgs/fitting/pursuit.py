@@ -11,10 +11,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
-from kcgs._triton import takes_triton
 from kcgs.functional import RegionMap, lookup_regions, region_splat
 from kcgs.functional.blur import gaussian_taps
-from kcgs.kernels import threads_for_torch
+from kcgs.kernels import takes_triton, threads_for_torch
 from kcgs.nn import GaussianField
 
 # Standard deviations that are tried, in pixels, by the side of the blocks that the residual is averaged over for them.

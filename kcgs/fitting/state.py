@@ -54,8 +54,8 @@ class FitState:
     history: list[HistoryEntry] = field(default_factory=list)
     pending: list[Measurement] = field(default_factory=list)
     """Measurements whose errors are not in the history yet."""
-    magnitude: Readback | None = None
-    """The largest absolute numbers of the field some iterations ago, where the host runs ahead."""
+    magnitudes: Readback | None = None
+    """The largest absolute numbers of the field and its gradients some iterations ago, where the host runs ahead."""
     best: Scene | None = None
     """A copy of the best scene that was measured."""
     best_score: float = -math.inf
@@ -70,7 +70,7 @@ class FitState:
     def runs_ahead(self) -> bool:
         """True where a step waits for nothing, so that the host is some iterations before the device.
 
-        Optimizers of published methods would keep a gradient that is not finite in their averages.
+        A step that the device had no room for has gradients of NaN, which GaussianAdam leaves out, and others do not.
         """
         return not self.problem.image.is_cpu and isinstance(self.optimizer, GaussianAdam)
 

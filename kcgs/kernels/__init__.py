@@ -14,12 +14,12 @@ All take the inputs of `interface`, with a `membership`, perhaps `resampled`, an
 from .cuda.capacity import settle, without_waiting
 from .interface import SplatInputs, Steps, with_autograd
 from .membership import Membership
-from .registry import BACKENDS, check_backend, prepare, resolve
+from .registry import BACKENDS, check_backend, prepare, resolve, takes_triton
 from .resampled import Resampled
 from .threads import image_threads_for_kernels, threads_for_kernels, threads_for_torch
 
 __all__ = [
     "BACKENDS", "Membership", "Resampled", "SplatInputs", "Steps", "check_backend",
-    "image_threads_for_kernels", "prepare", "resolve", "settle", "threads_for_kernels", "threads_for_torch",
-    "with_autograd", "without_waiting",
+    "image_threads_for_kernels", "prepare", "resolve", "settle", "takes_triton", "threads_for_kernels",
+    "threads_for_torch", "with_autograd", "without_waiting",
 ]  # fmt: skip

@@ -64,6 +64,13 @@ def _compiles(device: torch.device) -> bool:
     return True
 
 
+def takes_triton(*tensors: Tensor) -> bool:
+    """True where programs of Triton may change tensors: float32, contiguous, on a device that they compile for."""
+    return not torch.compiler.is_compiling() and all(
+        t.is_cuda and t.dtype is torch.float32 and t.is_contiguous() and _compiles(t.device) for t in tensors
+    )
+
+
 def check_backend(backend: str) -> str:
     """Return `backend` if it is a name of one."""
     if backend not in BACKENDS:

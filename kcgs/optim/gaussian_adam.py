@@ -13,8 +13,8 @@ from torch.nn.functional import pad
 from torch.optim import Optimizer
 
 from kcgs._check import check_number, verify
-from kcgs._triton import takes_triton
 from kcgs.errors import InvalidArgument, InvalidArgumentType
+from kcgs.kernels import takes_triton
 from kcgs.nn import GaussianField
 
 from .frame import local_gradient, move, widen
@@ -38,7 +38,8 @@ class GaussianAdam(Optimizer):
 
     Args:
         fields: a GaussianField, or several; batched ones, too.
-        lr: step of place in standard deviations, and of log scale.
+        lr: step of place in standard deviations, and of log scale. A tensor on the device of the fields is read at each
+            replay of a CUDA graph.
         color_lr: step of colours and opacities.
         betas: of the averages of gradients and of their squares.
         eps: added to the root of the latter.
@@ -103,8 +104,8 @@ class GaussianAdam(Optimizer):
             closure: evaluates the loss anew, and returns it.
 
         Raises:
-            ValueError: a gradient that is not finite, on the CPU, before anything moves. On another device, where the
-                step waits for nothing, the Gaussian of such a gradient stays as it is.
+            ValueError: a gradient that is not finite, on the CPU, before anything moves. On another device, which a
+                step does not wait for, a Gaussian with such a gradient stays as it is.
         """
         loss = None
         if closure is not None:

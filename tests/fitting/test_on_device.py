@@ -19,6 +19,7 @@ from kcgs.fitting import FitResult, descent
 from kcgs.fitting.readback import Readback
 from kcgs.fitting.state import FitState
 from kcgs.fitting.strategies import Densify, EndDrafts
+from kcgs.kernels.cuda.capacity import reports
 from kcgs.optim import gaussian_adam
 
 log = importlib.import_module("kcgs.fitting.log")
@@ -95,22 +96,30 @@ def test_a_late_log_is_the_log(ahead: pytest.MonkeyPatch) -> None:
     assert same(at_once, run(on_step=on_step)) and num_late > 50
 
 
-def test_nothing_moves_where_the_gradients_of_a_step_are_nan(ahead: pytest.MonkeyPatch) -> None:
-    """Such a step is as if it were not there."""
-    gradients, calls = descent.squared_error_gradients, []
+def test_nothing_moves_where_a_step_had_no_room(ahead: pytest.MonkeyPatch) -> None:
+    """Its gradients and its render are NaN; the history lacks it, and the next steps get more room."""
+    gradients, render, calls, settled = descent.squared_error_gradients, descent.render, [], []
 
-    def missed(*arguments: Any, **settings: Any) -> Any:
-        calls.append(1)
-        values = gradients(*arguments, **settings)
-        return tuple(value * math.nan for value in values) if len(calls) % 3 == 0 else values
+    def missed(function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any, **settings: Any) -> Any:
+            calls.append(1)
+            values = function(*arguments, **settings)
+            if reports() or len(calls) % 3:  # it waits, or there is room
+                return values
+            return values * math.nan if isinstance(values, Tensor) else tuple(value * math.nan for value in values)
+
+        return call
 
     whole = run()
-    ahead.setattr(descent, "squared_error_gradients", missed)
+    ahead.setattr(descent, "squared_error_gradients", missed(gradients))
+    ahead.setattr(loop, "render", missed(render))
+    ahead.setattr(descent, "settle", lambda device, size: settled.append(size))
     result = run()
-    assert len(calls) > ITERATIONS / 2
+    assert len(calls) == ITERATIONS and 3 < len(settled) < ITERATIONS / 20 and set(settled) == {(32, 40)}
+    assert len(whole.history) / 2 < len(result.history) < len(whole.history)
+    assert all(math.isfinite(entry.psnr) for entry in result.history)
     assert all(parameter.isfinite().all() for parameter in result.scene.field.parameters())
     assert max(e.psnr for e in result.history) > max(e.psnr for e in whole.history) - 1.5
-    assert all(math.isfinite(entry.psnr) for entry in result.history)
 
 
 def test_divergence_ends_the_fit_within_20_iterations(ahead: pytest.MonkeyPatch) -> None:
@@ -195,30 +204,33 @@ def test_a_step_reads_no_value_and_takes_few_operations(ahead: pytest.MonkeyPatc
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="it takes a GPU")
 @pytest.mark.parametrize("has_regions", [False, True])
 def test_no_step_waits_for_a_gpu(monkeypatch: pytest.MonkeyPatch, has_regions: bool) -> None:
-    """By torch's check of synchronisations, in all parts of a step but renders that are checked."""
+    """By torch's check of synchronisations, in all that a step does without an event."""
     calls = []
 
-    def without_waiting(function: Callable[..., Any]) -> Callable[..., Any]:
+    def without_waits(owner: Any, name: str, is_always: bool) -> None:
+        function = getattr(owner, name)
+
         @functools.wraps(function)
         def call(*arguments: Any, **settings: Any) -> Any:
-            calls.append(function.__name__)
+            calls.append(name)
             # the first step compiles, and finds the pixels near contours
-            torch.cuda.set_sync_debug_mode("error" if calls.count("step") > 1 else "default")
+            is_checked = calls.count("step") > 1 and (is_always or not reports())
+            torch.cuda.set_sync_debug_mode("error" if is_checked else "default")
             try:
                 return function(*arguments, **settings)
             finally:
                 torch.cuda.set_sync_debug_mode("default")
 
-        return call
+        monkeypatch.setattr(owner, name, call)
 
-    for owner, name in (
-        (loop, "has_diverged"), (loop, "log"), (loop, "take_up"), (descent, "squared_error_gradients"),
-        (gaussian_adam.GaussianAdam, "step"),
-    ):  # fmt: skip
-        monkeypatch.setattr(owner, name, without_waiting(getattr(owner, name)))
+    for name in ("has_diverged", "take_up"):
+        without_waits(loop, name, True)
+    without_waits(gaussian_adam.GaussianAdam, "step", True)
+    for name in ("render", "log", "backward"):
+        without_waits(loop, name, False)
     labels = (torch.arange(40) > 17).long().expand(32, 40) if has_regions else None
     results = [fit(image().cuda(), labels, 60, recipe=FitConfig(iterations=ITERATIONS)) for _ in range(2)]
-    assert calls.count("squared_error_gradients") > ITERATIONS / 2
+    assert calls.count("backward") == 2 * ITERATIONS
     assert all(torch.equal(*pair) for pair in zip(*(r.scene.field.parameters() for r in results), strict=True))
     on_cpu = fit(image(), labels, 60, recipe=FitConfig(iterations=ITERATIONS))
     assert max(e.psnr for e in results[0].history) > max(e.psnr for e in on_cpu.history) - 0.5
