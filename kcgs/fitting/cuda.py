@@ -31,21 +31,21 @@ def blur(planes: Tensor, labels: Tensor | None, sigma: float, norm_sigma: float,
             # without labels any address will do: it is not read
             _blur[(-(-height * width // _PIXELS), count)](
                 planes, planes if labels is None else labels, blurred, height * width, stride, length,
-                -0.5 / sigma**2, -0.5 / norm_sigma**2, REACH=reach, MAPPED=labels is not None, PIXELS=_PIXELS,
-                **_OPTIONS,
+                -0.5 / sigma**2, -0.5 / norm_sigma**2, reach, MAPPED=labels is not None, PIXELS=_PIXELS, **_OPTIONS,
             )  # fmt: skip
         planes = blurred
     return planes
 
 
-def _jit(function: Any) -> Any:
-    return triton.jit(function)
+def _program(function: Any) -> Any:
+    """Decorate a program to be compiled once for all sizes."""
+    return triton.jit(function, do_not_specialize=["area", "stride", "length", "reach"])
 
 
-@_jit
+@_program
 def _blur(  # type: ignore[no-untyped-def]
-    planes, labels, blurred, area, stride, length, exponent, norm_exponent,
-    REACH: tl.constexpr, MAPPED: tl.constexpr, PIXELS: tl.constexpr,
+    planes, labels, blurred, area, stride, length, exponent, norm_exponent, reach,
+    MAPPED: tl.constexpr, PIXELS: tl.constexpr,
 ):  # fmt: skip
     pixel = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     inside = pixel < area
@@ -56,7 +56,7 @@ def _blur(  # type: ignore[no-untyped-def]
     total = tl.zeros([PIXELS], tl.float32)
     if MAPPED:
         label = tl.load(labels + pixel, mask=inside, other=0.0)
-    for distance in range(-REACH, REACH + 1):
+    for distance in range(-reach, reach + 1):
         mask = inside & (place + distance >= 0) & (place + distance < length)
         other = pixel + distance * stride
         if MAPPED:

@@ -66,7 +66,8 @@ def step(tables: list[Tensor], gradients: list[Tensor | None], geometry: Adam, c
 
 
 def _jit(function: Any) -> Any:
-    return triton.jit(function)
+    """Decorate a function to be compiled once for any number of Gaussians."""
+    return triton.jit(function, do_not_specialize=["count"])
 
 
 @_jit

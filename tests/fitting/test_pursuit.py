@@ -228,8 +228,8 @@ class TestTriton:
         from kcgs.fitting import cuda
 
         monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
-        constants = {"REACH": 4, "MAPPED": has_labels, "PIXELS": cuda._PIXELS}
-        types = {**dict.fromkeys(constants, "constexpr"), **dict.fromkeys(("area", "stride", "length"), "i32")}
+        constants = {"MAPPED": has_labels, "PIXELS": cuda._PIXELS}
+        types = {**dict.fromkeys(constants, "constexpr"), **dict.fromkeys(("area", "stride", "length", "reach"), "i32")}
         types |= dict.fromkeys(("exponent", "norm_exponent"), "fp32")
         signature = {name: types.get(name, "*fp32") for name in cuda._blur.arg_names}
         source = triton.compiler.ASTSource(cuda._blur, signature, constants)
