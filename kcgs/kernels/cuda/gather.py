@@ -35,7 +35,7 @@ def differentiate(plan: Plan, inputs: SplatInputs, grad: Tensor, geometry: bool)
     num_pieces = plan.pieces.shape[1]
     with torch.cuda.device_of(terms):
         _gather(
-            (num_pieces,), terms, grad.contiguous(), colors, terms.stride(1), plan.pieces, num_pieces,
+            (num_pieces,), terms, grad.contiguous(), colors, plan.pieces, num_pieces,
             *lists_of(plan, inputs), *inputs.size, channels,
             BLOCK=channels_at_once(channels), MAPPED=inputs.coverage is not None, GEOMETRY=geometry,
         )  # fmt: skip
@@ -53,7 +53,7 @@ def error_gradients(plan: Plan, inputs: SplatInputs, target: Tensor) -> Gradient
 
 @program(warps=1)
 def _gather(  # type: ignore[no-untyped-def]
-    terms, grad, colors, channel_step, pieces, num_pieces,
+    terms, grad, colors, pieces, num_pieces,
     counters, lists, slots, coefficients, weights,
     room, num_cells, num_tiles, rows, cols, cutoff, height, width, channels,
     BLOCK: tl.constexpr, MAPPED: tl.constexpr, GEOMETRY: tl.constexpr,
@@ -78,27 +78,34 @@ def _gather(  # type: ignore[no-untyped-def]
     if MAPPED:
         plane = tl.load(slots + 2 * room + pair, mask=valid, other=-1)
         membership = weights + plane * (SIDE * SIDE) + first_row * SIDE
+    area = height.to(tl.int64) * width
+    columns = channels + (5 if GEOMETRY else 0)
     s1 = tl.zeros([PIECE * _PARTS], tl.float32)
     s2, s11, s12, s22 = s1, s1, s1, s1
     for base in range(0, channels, BLOCK):
-        channel = base + tl.arange(0, BLOCK)[:, None]
-        in_range = channel < channels
-        # a step between channels that the compiler does not know: else it would spread them over threads
-        color = colors + gaussian[None, :] * channels + channel * channel_step
-        color = tl.load(color, mask=in_range & valid[None, :], other=0.0)
-        sums = tl.zeros([BLOCK, PIECE * _PARTS], tl.float32)
-        corner = grad + ((image * channels + channel) * height + top + first_row[None, :]) * width + left
+        color = ()
+        sums = ()
+        for c in tl.static_range(BLOCK):
+            known = pair < tl.where(base + c < channels, end, first)
+            color += (tl.load(colors + gaussian * channels + base + c, mask=known, other=0.0),)
+            sums += (tl.zeros([PIECE * _PARTS], tl.float32),)
+        corner = grad + ((image * channels + base) * height + top + first_row) * width + left
         for row in range(SIDE // _PARTS):
             y = (first_row + row) - (SIDE - 1) / 2
-            in_row = in_range & (top + first_row + row < height)[None, :]
             for column in tl.range(tl.minimum(SIDE, width - left), loop_unroll_factor=_UNROLL):
                 z1, z2, weight = weigh(k0, k1, k2, k3, k4, column - (SIDE - 1) / 2, y, cutoff)
                 if MAPPED:
                     weight *= tl.load(membership + row * SIDE + column, mask=plane >= 0, other=1.0)
-                local = tl.load(corner + row * width + column, mask=in_row, other=0.0)
-                sums += local * weight[None, :]
+                product = tl.zeros([PIECE * _PARTS], tl.float32)
+                added = ()
+                for c in tl.static_range(BLOCK):
+                    in_range = first_row + row < tl.where(base + c < channels, height - top, 0)
+                    local = tl.load(corner + (c * area + row * width + column), mask=in_range, other=0.0)
+                    added += (sums[c] + local * weight,)
+                    product += local * color[c]
+                sums = added
                 if GEOMETRY:
-                    first_moment = tl.sum(local * color, axis=0) * weight
+                    first_moment = product * weight
                     second_moment = first_moment * z2
                     first_moment *= z1
                     s1 += first_moment
@@ -106,16 +113,15 @@ def _gather(  # type: ignore[no-untyped-def]
                     s11 += first_moment * z1
                     s12 += first_moment * z2
                     s22 += second_moment * z2
-        place = (first + tl.arange(0, PIECE)).to(tl.int64)[None, :] * (channels + (5 if GEOMETRY else 0)) + channel
-        sums = tl.sum(tl.reshape(sums, [BLOCK, _PARTS, PIECE]), axis=1)
-        kept = in_range & (first + tl.arange(0, PIECE) < end)[None, :]
-        tl.store(terms + place + (5 if GEOMETRY else 0), sums, mask=kept)
+        for c in tl.static_range(BLOCK):
+            if base + c < channels:
+                _store(terms + (5 if GEOMETRY else 0) + base + c, sums[c], first, end, columns)
     if GEOMETRY:
-        _store(terms, s1, first, end, channels + 5)
-        _store(terms + 1, s2, first, end, channels + 5)
-        _store(terms + 2, s11, first, end, channels + 5)
-        _store(terms + 3, s12, first, end, channels + 5)
-        _store(terms + 4, s22, first, end, channels + 5)
+        _store(terms, s1, first, end, columns)
+        _store(terms + 1, s2, first, end, columns)
+        _store(terms + 2, s11, first, end, columns)
+        _store(terms + 3, s12, first, end, columns)
+        _store(terms + 4, s22, first, end, columns)
 
 
 @triton.jit

@@ -16,7 +16,7 @@ from .plan import SIDE, Plan, fails
 from .program import program
 
 # channels that a thread holds at once, in registers
-_MAX_CHANNELS = 8
+_MAX_CHANNELS = 4
 # pairs whose loads are under way at once
 _UNROLL = tl.constexpr(4)
 # a smaller weight is 0
@@ -45,8 +45,8 @@ def lists_of(plan: Plan, inputs: SplatInputs) -> tuple[Any, ...]:
 
 
 def channels_at_once(channels: int) -> int:
-    """Return the channels of a program, a power of two."""
-    return min(_MAX_CHANNELS, 1 << (channels - 1).bit_length())
+    """Return the channels of a program."""
+    return min(_MAX_CHANNELS, channels)
 
 
 @triton.jit
@@ -68,8 +68,10 @@ def _render(  # type: ignore[no-untyped-def]
     pixel = tl.arange(0, SIDE * SIDE)
     across, down = pixel % SIDE, pixel // SIDE
     x, y = across - (SIDE - 1) / 2, down - (SIDE - 1) / 2
-    channel = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)[:, None]
-    value = tl.zeros([BLOCK, SIDE * SIDE], tl.float32)
+    base = tl.program_id(1) * BLOCK
+    value = ()
+    for c in tl.static_range(BLOCK):
+        value += (tl.zeros([SIDE * SIDE], tl.float32),)
     first = tl.load(lists + num_cells + tile)
     count = tl.load(lists + 2 * num_cells + num_tiles + tile)
     k = coefficients + first.to(tl.int64) * 5
@@ -78,16 +80,20 @@ def _render(  # type: ignore[no-untyped-def]
         if MAPPED:
             place = tl.load(slots + 2 * room + pair) * (SIDE * SIDE) + pixel  # below 0 where the region is alone
             weight *= tl.load(weights + place, mask=place >= 0, other=1.0)
-        gaussian = tl.load(slots + room + pair).to(tl.int64)
-        color = tl.load(colors + gaussian * channels + channel, mask=channel < channels, other=0.0)
-        value += color * weight[None, :]
+        color = colors + tl.load(slots + room + pair).to(tl.int64) * channels + base
+        added = ()
+        for c in tl.static_range(BLOCK):
+            added += (value[c] + tl.load(color + c, mask=base + c < channels, other=0.0) * weight,)
+        value = added
         k += 5
 
     row, column = tile // cols % rows * SIDE + down, tile % cols * SIDE + across
-    plane = (tile // (rows * cols)).to(tl.int64) * channels + channel
-    address = (plane * height + row[None, :]) * width + column[None, :]
-    inside = (channel < channels) & ((row < height) & (column < width))[None, :]
-    if target is not None:
-        value -= tl.load(target + address, mask=inside, other=0.0)
-    value = tl.where(fails(counters, room), float("nan"), value)
-    tl.store(image + address, value, mask=inside)
+    plane = (tile // (rows * cols)).to(tl.int64) * channels + base
+    failed = fails(counters, room)
+    for c in tl.static_range(BLOCK):
+        place = ((plane + c) * height + row) * width + column
+        inside = (row < tl.where(base + c < channels, height, 0)) & (column < width)
+        result = value[c]
+        if target is not None:
+            result -= tl.load(target + place, mask=inside, other=0.0)
+        tl.store(image + place, tl.where(failed, float("nan"), result), mask=inside)
