@@ -49,7 +49,7 @@ def region_splat(
         region_ids: integer region of each Gaussian, :math:`(B, N)`; needed where `regions` is given, and None without.
         regions: a RegionMap, or labels, :math:`(H, W)` or :math:`(B, H, W)`, whose contours are hard; None: one region.
         size: (height, width); needed without `regions`, else it must equal theirs.
-        cutoff: weights below it are skipped, in [0, 1), and wide Gaussians are interpolated between coarse nodes as
+        cutoff: weights below it are skipped, in [0, 1), and cpu interpolates wide Gaussians between coarse nodes as
             closely; 0 evaluates all at all pixels. Skipping a Gaussian is off by cutoff times its absolute colour at
             most, interpolating by 3.2 times that: see docs/performance.md.
         backend: auto, reference, tiled, cpu or cuda.

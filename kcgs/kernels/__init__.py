@@ -3,12 +3,12 @@
 From the name of a backend to its innermost loop: `registry`, then one of four kernels.
 
 - `reference`: the sum as it is written.
-- `tiled`: `pairs` of Gaussians and tiles, matrix products.
+- `tiled`: chunks of Gaussians and tiles, plain torch, the gradient by autograd.
 - `cuda`: Triton's programs, which plan, render and gather.
 - `cpu`: its own `lists`, numba's loops, vector code.
 
-All take the inputs of `interface`, with a `membership`, perhaps `resampled`, and share `whitened` coordinates. All but
-`reference` share `tiles` and `coarse_grids`; `splines` join these for tiled and cuda.
+All take the inputs of `interface`, with a `membership`, perhaps `resampled`, and share `whitened` coordinates.
+`tiled` and `cuda` share `tiles`; `cpu` evaluates wide Gaussians on `coarse_grids`.
 """
 
 from .cuda.capacity import settle, without_waiting

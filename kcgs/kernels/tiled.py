@@ -1,45 +1,64 @@
-"""The kernel `tiled`: batched matrix products over tiles of 16 x 16 pixels, any device, backward by hand.
+"""The kernel `tiled`: plain torch over tiles of 16 x 16 pixels, in float32 and float64, on any device.
 
-Whitened coordinates are affine in the pixel, so for a whole tile they are two small matrix products in tile-centred
-coordinates whose constants are made in float64; the image and the colour gradients are batched products too.
+The Gaussians of a tile and a region are cut into pieces of one length, and these are evaluated chunk by chunk. The
+gradient is autograd's: a chunk is evaluated again when it is differentiated, so that memory stays flat.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad, threshold
 
-from .interface import Gradients, SplatInputs, Steps
-from .pairs import Pairs, colors_of, gradients_of, list_pairs
-from .splines import gather, sample
-from .tiles import TILE, expand_runs, grid_of, join_tiles, split_into_tiles, sum_runs
-from .whitened import least_exponent
+from .interface import Gradients, SplatInputs, Steps, with_autograd
+from .membership import TileMembership
+from .tiles import (
+    TILE,
+    TileGrid,
+    bounding_tiles,
+    coefficients,
+    expand_runs,
+    find_keys,
+    grid_of,
+    join_tiles,
+    reaches,
+    split_into_tiles,
+    sum_runs,
+)
+from .whitened import least_exponent, sums_to_gradients, support_radius
 
-# weights (pairs times pixels) of a batch, 1 MiB in float32: more would leave the caches, fewer take more calls
-_CHUNK_WEIGHTS = 1 << 18
-# pairs of a segment: a tile with more has several
-_MAX_SEGMENT = 1024
-# of a tile
-_PIXELS = TILE * TILE
-
-
-class _Batch(NamedTuple):
-    """Tile segments of similar list length, padded to the longest."""
-
-    segments: Tensor  # [T] int64
-    entries: Tensor  # [T, G] int64 into the pairs, padded with the number of pairs
-    mixed: bool  # whether the tiles hold several regions, and so have masks
+# pairs of a piece: more would pad most pieces, fewer would sum more of them
+_PIECE = 16
+# pieces of a chunk: weights of 2 MiB in float32, more would leave the caches
+_CHUNK = 128
 
 
 class _Plan(NamedTuple):
-    pairs: Pairs
-    batches: list[_Batch]
-    segment_tile: Tensor  # [S] int64, ascending
-    coefficients: Tensor  # [P + 1, 5]
-    masks: Tensor | None  # [K, 256], in the dtype of the inputs
+    """The (Gaussian, tile) pairs that may give a weight, and pieces: pairs of one block, a tile and a region in it.
+
+    Since no piece has two regions, what one region holds changes no bit of another.
+    """
+
+    gaussian: Tensor  # [P] int64, b * N + i, ascending
+    coefficients: Tensor  # [P, 5], in the dtype of the inputs: see tiles.coefficients
+    pieces: Tensor  # [S, _PIECE] int64 into the pairs, padded with -1
+    tile: Tensor  # [S] int64, ascending
+    mask_rows: Tensor  # [S] int64 into masks
+    masks: Tensor  # [K + 1, 256], in the dtype of the inputs; the last, of ones, is -1
+
+
+class _Chunk(NamedTuple):
+    """What some pieces are evaluated from."""
+
+    pieces: Tensor  # [T, _PIECE] int64
+    tile: Tensor  # [T] int64
+    coefficients: Tensor  # [T, _PIECE, 5]
+    colors: Tensor  # [T, _PIECE, C], 0 in the padding
+    masks: Tensor  # [T, 1, 256]
 
 
 def steps(inputs: SplatInputs) -> Steps:
@@ -48,114 +67,101 @@ def steps(inputs: SplatInputs) -> Steps:
 
 
 def _make_plan(inputs: SplatInputs) -> _Plan:
-    pairs = list_pairs(inputs)
-    masks = None
-    if pairs.mask_rows is not None and inputs.membership is not None:
-        masks = inputs.membership.tiles(TILE).masks.to(inputs.means.dtype)
-
-    # segments: a tile's list cut into pieces of at most _MAX_SEGMENT
-    order = torch.argsort(pairs.tile, stable=True)
-    tiles, lengths = torch.unique_consecutive(pairs.tile[order], return_counts=True)
-    run, piece = expand_runs(-(-lengths // _MAX_SEGMENT))
-    start = (lengths.cumsum(0) - lengths)[run] + piece * _MAX_SEGMENT
-    length = (lengths[run] - piece * _MAX_SEGMENT).clamp_max(_MAX_SEGMENT)
-    mixed = torch.zeros_like(length, dtype=torch.bool)
-    if pairs.mask_rows is not None:
-        mixed = pairs.mask_rows[order][start] >= 0
-    batches = [
-        batch
-        for kind in (False, True)
-        for batch in _batches((mixed == kind).nonzero().flatten(), start, length, order, kind)
-    ]
-    return _Plan(pairs, batches, tiles[run], _padded(pairs.coefficients), masks)
+    table, num_regions = _tile_regions(inputs)
+    grid, keys = grid_of(inputs), table.keys
+    gaussian, block, affine = _list_pairs(inputs, grid, keys, num_regions)
+    order = torch.argsort(block, stable=True)
+    blocks, lengths = torch.unique_consecutive(block[order], return_counts=True)
+    run, piece = expand_runs(-(-lengths // _PIECE))
+    rank = piece[:, None] * _PIECE + torch.arange(_PIECE, device=order.device)
+    position = (lengths.cumsum(0) - lengths)[run, None] + rank
+    pieces = torch.where(rank < lengths[run, None], pad(order, (0, _PIECE))[position], -1)
+    image, row = blocks[run] // len(keys), blocks[run] % len(keys)
+    tiles = grid.rows * grid.cols
+    tile = image * tiles + keys[row] // num_regions % tiles
+    masks = pad(table.masks.to(affine.dtype), (0, 0, 0, 1), value=1.0)
+    return _Plan(gaussian, affine, pieces, tile, table.mask_rows[row], masks)
 
 
-def _batches(segments: Tensor, start: Tensor, length: Tensor, order: Tensor, mixed: bool) -> Iterator[_Batch]:
-    segments = segments[torch.argsort(length[segments], descending=True, stable=True)]
-    lengths = length[segments].tolist()
-    begin = 0
-    while begin < len(lengths):
-        longest = lengths[begin]
-        end = min(len(lengths), begin + max(1, _CHUNK_WEIGHTS // (longest * _PIXELS)))
-        part = segments[begin:end]
-        step = torch.arange(longest, device=order.device)
-        valid = step < length[part, None]
-        entries = torch.where(valid, order[(start[part, None] + step).clamp_max(len(order) - 1)], len(order))
-        yield _Batch(part, entries, mixed)
-        begin = end
+def _tile_regions(inputs: SplatInputs) -> tuple[TileMembership, int]:
+    """Return the regions of tiles, and the number of regions; without a map, one is everywhere."""
+    if inputs.membership is not None:
+        return inputs.membership.tiles(TILE), inputs.membership.num_regions
+    grid = grid_of(inputs)
+    keys = torch.arange(grid.rows * grid.cols, device=inputs.means.device)
+    return TileMembership(keys, torch.full_like(keys, -1), inputs.means.new_zeros(0, TILE * TILE)), 1
 
 
-def _padded(rows: Tensor) -> Tensor:
-    return torch.cat([rows, rows.new_zeros(1, rows.shape[-1])])
+def _list_pairs(inputs: SplatInputs, grid: TileGrid, keys: Tensor, num_regions: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return Gaussians, blocks and coefficients of pairs, in the order of the Gaussians.
+
+    The block of image b and key k is b * len(keys) + k, also where images have maps of their own.
+    """
+    means, cholesky = (t.detach().double().flatten(0, 1) for t in inputs[:2])
+    radius = support_radius(inputs.cutoff, inputs.means.dtype)
+    gaussian, place, origin = bounding_tiles(means, cholesky, radius, inputs.size)
+    image, tile = gaussian // inputs.means.shape[1], place[:, 1] * grid.cols + place[:, 0]
+    if inputs.membership is not None and len(inputs.membership.index) > 1:
+        tile = image * grid.rows * grid.cols + tile
+    region = torch.zeros_like(gaussian) if inputs.region_index is None else inputs.region_index.flatten()[gaussian]
+    row, is_present = find_keys(keys, tile, region, num_regions)
+    pairs = (is_present & reaches(origin, cholesky[gaussian], radius)).nonzero().flatten()
+    gaussian, block = gaussian[pairs], (image * len(keys) + row)[pairs]
+    return gaussian, block, coefficients(origin[pairs], cholesky[gaussian]).to(inputs.means.dtype)
 
 
-def _bases(means: Tensor) -> tuple[Tensor, Tensor]:
-    """Return what the coefficients of z1 and of z2 multiply at the pixels of a tile, in the dtype of the means."""
-    offset = torch.arange(TILE, device=means.device, dtype=means.dtype) - (TILE - 1) / 2
-    x, y = offset.repeat(TILE), offset.repeat_interleave(TILE)
-    ones = torch.ones_like(x)
-    return torch.stack([ones, x]), torch.stack([ones, x, y])  # [2, 256], [3, 256]
+def _chunks(plan: _Plan, inputs: SplatInputs) -> Iterator[_Chunk]:
+    colors = inputs.colors.detach().flatten(0, 1)
+    for begin in range(0, len(plan.pieces), _CHUNK):
+        pieces, tile, mask_rows = (t[begin : begin + _CHUNK] for t in (plan.pieces, plan.tile, plan.mask_rows))
+        members = colors[plan.gaussian[pieces]].masked_fill(pieces[..., None] < 0, 0.0)
+        yield _Chunk(pieces, tile, plan.coefficients[pieces], members, plan.masks[mask_rows, None])
 
 
-def _weights(plan: _Plan, batch: _Batch, bases: tuple[Tensor, Tensor], cutoff: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Return z1, z2 and the weight, times the membership of the pixel, each [T, G, 256]."""
-    k = plan.coefficients[batch.entries]
-    z1 = k[..., :2] @ bases[0]
-    z2 = k[..., 2:] @ bases[1]
-    weight = (z1 * z1).addcmul_(z2, z2).mul_(-0.5).clamp_(min=least_exponent(0.0, k.dtype)).exp_()
-    if cutoff > 0.0:
-        weight.mul_(weight >= cutoff)
-    if batch.mixed:
-        assert plan.masks is not None and plan.pairs.mask_rows is not None
-        mask_rows = torch.cat([plan.pairs.mask_rows, plan.pairs.mask_rows.new_zeros(1)])[batch.entries]
-        weight.mul_(plan.masks[mask_rows])
-    return z1, z2, weight
-
-
-def _padded_colors(plan: _Plan, inputs: SplatInputs) -> Tensor:
-    return _padded(colors_of(plan.pairs, inputs)[plan.pairs.gaussian])  # [P + 1, C]
+def _evaluate(chunk: _Chunk, cutoff: float) -> Tensor:
+    """Sum the Gaussians of each piece over its tile, (T, C, 256)."""
+    k0, k1, k2, k3, k4 = chunk.coefficients[..., None, None].unbind(2)
+    offset = torch.arange(TILE, device=k0.device, dtype=k0.dtype) - (TILE - 1) / 2
+    # element by element: a matrix product may be of less precision on a GPU, as the user has set it
+    z1 = k0 + k1 * offset  # [T, _PIECE, 1, 16]
+    z2 = k2 + k4 * offset[:, None] + k3 * offset  # [T, _PIECE, 16, 16]
+    least = least_exponent(cutoff, k0.dtype)
+    # exp() is slow where its result is no normal number, and `threshold` faster than `where`
+    exponent = threshold(-0.5 * (z1.square() + z2.square()), least - 1, least - 1)
+    weight = threshold(exponent.exp(), math.exp(least), 0.0)
+    return chunk.colors.mT @ weight.flatten(2) * chunk.masks
 
 
 def _render(plan: _Plan, inputs: SplatInputs) -> Tensor:
-    colors, bases = _padded_colors(plan, inputs), _bases(inputs.means)
-    channels = colors.shape[-1]
-    values = colors.new_empty(len(plan.segment_tile), channels, _PIXELS)
-    for batch in plan.batches:
-        _, _, weight = _weights(plan, batch, bases, inputs.cutoff)
-        values[batch.segments] = colors[batch.entries].transpose(1, 2) @ weight
-    tile_ids, counts = torch.unique_consecutive(plan.segment_tile, return_counts=True)
-    if len(tile_ids) < len(values):
-        values = sum_runs(values.flatten(1), counts).unflatten(1, (channels, _PIXELS))
-    tiles = colors.new_zeros(plan.pairs.num_tiles, channels, _PIXELS)
-    tiles[tile_ids] = values
-    tiles, grid = tiles.unflatten(2, (TILE, TILE)), grid_of(inputs)
-    if plan.pairs.wide is not None:
-        sample(tiles[grid.total :], plan.pairs.wide.nodes, plan.masks, tiles[: grid.total])
-    return join_tiles(tiles[: grid.total].unflatten(0, grid), inputs.size)
+    grid, channels = grid_of(inputs), inputs.colors.shape[-1]
+    tiles = inputs.colors.new_zeros(grid.total, channels * TILE * TILE)
+    for chunk in _chunks(plan, inputs):
+        values = _evaluate(chunk, inputs.cutoff).flatten(1)
+        tile, counts = torch.unique_consecutive(chunk.tile, return_counts=True)
+        # pieces are added one after the other, wherever a chunk ends: the bits do not depend on that
+        values[counts.cumsum(0) - counts] += tiles[tile]
+        tiles[tile] = sum_runs(values, counts)
+    return join_tiles(tiles.view(*grid, channels, TILE, TILE), inputs.size)
 
 
 def _differentiate(plan: _Plan, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
-    grad = split_into_tiles(grad).flatten(0, 2)  # [tiles, C, 16, 16]
-    if plan.pairs.wide is not None:
-        grad = torch.cat([grad, gather(grad, plan.pairs.wide.nodes, plan.masks)])
-    grad = grad.flatten(2)
-    colors, bases = _padded_colors(plan, inputs), _bases(inputs.means)
-    sums = colors.new_zeros(len(colors), (5 if geometry else 0) + colors.shape[-1])
-    for batch in plan.batches:
-        z1, z2, weight = _weights(plan, batch, bases, inputs.cutoff)
-        local = grad[plan.segment_tile[batch.segments]]
-        parts = [weight @ local.transpose(1, 2)]
-        if geometry:
-            parts.append(_moments(z1, z2, weight.mul_(colors[batch.entries] @ local)))
-        sums[batch.entries] = torch.cat(parts, -1)
-    counts = torch.bincount(plan.pairs.gaussian, minlength=inputs.means.shape[0] * inputs.means.shape[1])
-    return gradients_of(plan.pairs, inputs, sum_runs(sums[:-1], counts))
+    grad = split_into_tiles(grad).flatten(0, 2).flatten(2)  # [tiles, C, 256]
+    shape, channels = inputs.means.shape[:2], inputs.colors.shape[-1]
+    # one more row, for the padding
+    terms = grad.new_empty(len(plan.gaussian) + 1, channels + (5 if geometry else 0))
+    for chunk in _chunks(plan, inputs):
+        leaves = [t.requires_grad_() for t in ((chunk.colors, chunk.coefficients) if geometry else (chunk.colors,))]
+        with with_autograd():
+            gradients = torch.autograd.grad(_evaluate(chunk, inputs.cutoff), leaves, grad[chunk.tile])
+        moments = [_moments(chunk.coefficients.detach(), gradients[1])] if geometry else []
+        terms[chunk.pieces] = torch.cat([gradients[0], *moments], -1)
+    sums = sum_runs(terms[:-1], torch.bincount(plan.gaussian, minlength=shape.numel()))
+    return sums_to_gradients(sums.unflatten(0, shape), channels, inputs.cholesky.detach())
 
 
-def _moments(z1: Tensor, z2: Tensor, value: Tensor) -> Tensor:
-    """Sum v (z1, z2, z1 z1, z1 z2, z2 z2) over the pixels, [T, G, 5]."""
-    first = value * z1
-    second = value.mul_(z2)
-    mean = torch.stack([first.sum(-1), second.sum(-1)], -1)
-    cross = (second * z1).sum(-1)
-    return torch.cat([mean, torch.stack([first.mul_(z1).sum(-1), cross, second.mul_(z2).sum(-1)], -1)], -1)
+def _moments(coefficients: Tensor, grad: Tensor) -> Tensor:
+    """Turn gradients of coefficients, [..., 5], into the moments that `sums_to_gradients` takes."""
+    # products may be beyond float32
+    (k0, k1, k2, k3, k4), (g0, g1, g2, g3, g4) = (t.double().unbind(-1) for t in (coefficients, grad))
+    rows = [g0, g2, k0 * g0 + k1 * g1, k0 * g2 + k1 * g3, k2 * g2 + k3 * g3 + k4 * g4]
+    return -torch.stack(rows, -1).to(grad.dtype)

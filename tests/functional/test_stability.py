@@ -84,6 +84,19 @@ def test_centres_far_away(backend: str, distance: float) -> None:
     assert gradient < 1e-4
 
 
+@pytest.mark.parametrize(
+    ("backend", "dtype"), [("tiled", torch.float32), ("tiled", torch.float64), ("cpu", torch.float32)]
+)
+def test_weights_that_are_nothing(backend: str, dtype: torch.dtype) -> None:
+    """Below e^-80, in float64 e^-700, a weight is 0, whatever it is multiplied by."""
+    scene = [torch.full((1, 2), 0.5), torch.tensor([[0.2, 0.0, 0.2]]), torch.full((1, 1), 1e30)]
+    leaves = [t.to(dtype).requires_grad_() for t in scene]
+    image = region_splat(*leaves, size=(16, 16), cutoff=0, backend=backend)
+    far = image[:, 8:, 8:]
+    assert image.any() and not far.any()
+    assert not any(gradient.any() for gradient in torch.autograd.grad(far.sum(), leaves))
+
+
 @pytest.mark.filterwarnings("ignore:.* Gaussians paint nothing:UserWarning")
 @pytest.mark.parametrize("size", [(1, 1), (1, 700), (700, 1), (3, 17)])
 @pytest.mark.parametrize("count", [0, 1, 40])

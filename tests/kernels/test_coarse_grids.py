@@ -1,4 +1,4 @@
-"""Coarse grids: the level of each Gaussian, agreement of backends, gradients."""
+"""Coarse grids: the level of each Gaussian, and the CPU kernel against their formulas."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcgs.kernels import Membership, SplatInputs, reference, tiled
+from kcgs.kernels import Membership, SplatInputs, reference
 from kcgs.kernels.coarse_grids import choose_levels, coarsen, grids_of, max_spacing, uncoarsen
 from kcgs.kernels.cpu import kernel as cpu
 from kcgs.kernels.pairs import list_pairs
@@ -45,8 +45,68 @@ def render(kernel: object, inputs: SplatInputs) -> list[Tensor]:
     steps = kernel.steps(inputs)  # type: ignore[attr-defined]
     plan = steps.plan(inputs)
     image = steps.render(plan, inputs)
-    probe = torch.linspace(-1, 2, image.numel(), dtype=torch.float64).view_as(image).to(image.dtype)
-    return [image, *steps.differentiate(plan, inputs, probe, True)]
+    return [image, *steps.differentiate(plan, inputs, probe(image), True)]
+
+
+def probe(image: Tensor) -> Tensor:
+    return torch.linspace(-1, 2, image.numel(), dtype=torch.float64).view_as(image).to(image.dtype)
+
+
+def render_formulas(inputs: SplatInputs) -> list[Tensor]:
+    """Return the same as the formulas of docs/performance.md have it: dense, in float64, differentiated by autograd."""
+    leaves = [t.double().requires_grad_() for t in inputs[:3]]
+    images = []
+    for b in range(len(leaves[0])):
+        gaussians = [t[b] for t in leaves]
+        if inputs.membership is None or inputs.region_index is None:
+            images.append(_render_region(*gaussians, inputs))
+            continue
+        total = torch.zeros(3, *inputs.size, dtype=torch.float64)
+        for region in range(inputs.membership.num_regions):
+            members = inputs.region_index[b] == region
+            weights = inputs.membership.weights(b % len(inputs.membership.index), region, torch.float64)
+            total = total + weights * _render_region(*(t[members] for t in gaussians), inputs)
+        images.append(total)
+    image = torch.stack(images)
+    return [image.detach(), *torch.autograd.grad(image, leaves, probe(image))]
+
+
+def _render_region(means: Tensor, cholesky: Tensor, colors: Tensor, inputs: SplatInputs) -> Tensor:
+    grids = grids_of(inputs.size, 1)
+    level = choose_levels(cholesky.detach(), max_spacing(inputs.cutoff), len(grids))
+
+    def evaluate(*gaussians: Tensor, n: int) -> Tensor:
+        size = grids[n].height, grids[n].width
+        return reference.splat(SplatInputs(*(t[None] for t in gaussians), None, None, size, inputs.cutoff))[0]
+
+    image = evaluate(means[level == 0], cholesky[level == 0], colors[level == 0], n=0)
+    nodes = torch.zeros(len(image), grids[-1].height, grids[-1].width, dtype=torch.float64)
+    for n in reversed(range(1, len(grids))):
+        wide = level == n
+        coarse = coarsen(level[wide], means[wide], cholesky[wide])
+        nodes = nodes + evaluate(coarse.means, coarse.cholesky, coarse.factor[:, None] * colors[wide], n=n)
+        weights = _sampling if n == 1 else _refinement
+        rows, columns = (weights(*sides) for sides in zip(grids[n - 1][:2], grids[n][:2], strict=True))
+        nodes = rows @ nodes @ columns.T
+    return image + nodes if len(grids) > 1 else image
+
+
+def _refinement(fine: int, coarse: int) -> Tensor:
+    """Return (1, 4, 6, 4, 1) / 8 about each node of an axis."""
+    weights = {d: math.comb(4, d + 2) / 8 for d in range(-2, 3)}
+    rows = [[weights.get(j - 2 * k + 1, 0.0) for k in range(coarse)] for j in range(fine)]
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+def _sampling(pixels: int, nodes: int) -> Tensor:
+    """Return the cubic B-splines of nodes, the first at -2 pixels, at the centres of pixels."""
+    return torch.tensor([[_spline(abs((j + 0.5) / 2 - (k - 1))) for k in range(nodes)] for j in range(pixels)]).double()
+
+
+def _spline(distance: float) -> float:
+    if distance < 1:
+        return 2 / 3 - distance**2 + distance**3 / 2
+    return max(2 - distance, 0.0) ** 3 / 6
 
 
 def assert_close(got: list[Tensor], want: list[Tensor], tolerance: float) -> None:
@@ -59,15 +119,20 @@ def assert_close(got: list[Tensor], want: list[Tensor], tolerance: float) -> Non
 @pytest.mark.parametrize(
     ("batch", "maps", "softness"), [(1, 0, 0.0), (2, 0, 0.0), (1, 1, 0.0), (2, 1, 0.7), (2, 2, 0.7)]
 )
-def test_backends_agree(size: tuple[int, int], batch: int, maps: int, softness: float) -> None:
+def test_cpu_agrees(size: tuple[int, int], batch: int, maps: int, softness: float) -> None:
     inputs = make_inputs(size, batch=batch, maps=maps, softness=softness)
-    assert (list_pairs(inputs).wide is None) == (max(size) <= 32)
-    got, exact = render(tiled, inputs), render(tiled, double(inputs))
-    assert_close(got, render(cpu, inputs), 4e-6)
-    assert_close(got, exact, 4e-6)
+    assert has_nodes(inputs) == (max(size) > 32)
+    got = render(cpu, inputs)
+    assert_close(got, render_formulas(inputs), 4e-6)
     want = render(reference, double(inputs)._replace(cutoff=0.0))
-    assert_close(exact[:1], want[:1], 5e-4)
-    assert_close(exact[1:], want[1:], 3e-3)
+    assert_close(got[:1], want[:1], 5e-4)
+    assert_close(got[1:], want[1:], 3e-3)
+
+
+def has_nodes(inputs: SplatInputs) -> bool:
+    lists = cpu.plan(inputs)
+    assert lists is not None
+    return bool(lists.live.any())
 
 
 def test_one_gaussian_of_each_level() -> None:
@@ -75,29 +140,14 @@ def test_one_gaussian_of_each_level() -> None:
     sigma = 2.0 ** torch.arange(4) / (max_spacing(CUTOFF) / 2**0.25) * 1.01
     cholesky = sigma[:, None] * torch.tensor([[[1.0, 0.0, 1.0]]])
     inputs = inputs._replace(cholesky=cholesky, region_index=torch.tensor([[0, 1, 2, 1]]))
-    pairs = list_pairs(inputs)
-    assert pairs.wide is not None and pairs.wide.gaussians.level.tolist() == [1, 2, 3]
-    assert pairs.wide.ids.tolist() == [1, 2, 3]
-    assert_close(render(tiled, inputs), render(cpu, inputs), 2e-6)
+    assert choose_levels(cholesky[0].double(), max_spacing(CUTOFF), 4).tolist() == [0, 1, 2, 3]
+    assert_close(render(cpu, inputs), render_formulas(inputs), 2e-6)
 
 
 def test_narrow_gaussians_have_no_grids() -> None:
-    inputs = make_inputs(maps=1)._replace(cholesky=torch.tensor([1.9, 0.0, 1.9]).expand(1, 40, 3))
-    assert list_pairs(inputs).wide is None
-    assert list_pairs(make_inputs(maps=1)._replace(cutoff=0.0)).wide is None
-    assert inputs.membership is not None and "blocks" not in inputs.membership._derived
-
-
-def test_no_gaussians() -> None:
-    inputs = make_inputs(n=0, maps=1)
-    image, *gradients = render(tiled, inputs)
-    assert torch.equal(image, torch.zeros(1, 3, 110, 150))
-    assert [g.shape for g in gradients] == [(1, 0, 2), (1, 0, 3), (1, 0, 3)]
-
-
-def test_same_bits_every_time() -> None:
-    inputs = make_inputs(batch=2, maps=1, softness=0.7)
-    assert all(map(torch.equal, render(tiled, inputs), render(tiled, inputs)))
+    inputs = make_inputs(maps=1)
+    assert has_nodes(inputs) and not has_nodes(inputs._replace(cutoff=0.0))
+    assert not has_nodes(inputs._replace(cholesky=torch.tensor([1.9, 0.0, 1.9]).expand(1, 40, 3)))
 
 
 def test_gather_is_the_transpose_of_sample() -> None:
@@ -154,23 +204,3 @@ def test_gradients_of_coarsened_gaussians() -> None:
     want = torch.autograd.grad(coarse[1:], leaves, grads)
     got = uncoarsen(given[1], coarse, *grads)
     torch.testing.assert_close(got, want, rtol=1e-10, atol=1e-12)
-
-
-def test_gradcheck() -> None:
-    """All weights reach the cutoff and no Gaussian changes its level, so that what is rendered is smooth."""
-    inputs = double(make_inputs((40, 36), n=3, maps=1, softness=0.7))
-    scales = torch.tensor([[30.0], [45.0], [20.0]], dtype=torch.float64)
-    cholesky = scales * torch.tensor([[[1.0, 0.2, 1.2]]], dtype=torch.float64)
-    centred = torch.tensor([[[18.0, 20.0], [10.0, 25.0], [20.0, 12.0]]], dtype=torch.float64)
-    inputs = inputs._replace(means=centred, cholesky=cholesky, region_index=torch.tensor([[0, 1, 2]]))
-    _, *gradients = render(tiled, inputs)
-    for k, gradient in enumerate(gradients):
-        given = inputs[:3][k]
-        direction = torch.randn(given.shape, generator=torch.Generator().manual_seed(k), dtype=torch.float64)
-        sides = []
-        for step in (-1e-4, 1e-4):
-            arrays = (given + step * direction if n == k else t for n, t in enumerate(inputs[:3]))
-            image = render(tiled, SplatInputs(*arrays, *inputs[3:]))[0]
-            sides.append((image * torch.linspace(-1, 2, image.numel(), dtype=torch.float64).view_as(image)).sum())
-        want = (sides[1] - sides[0]).item() / 2e-4
-        assert math.isclose((gradient * direction).sum().item(), want, rel_tol=1e-6)
