@@ -1,12 +1,11 @@
 """Coarse grids for wide Gaussians, which are evaluated at nodes, and carried to the pixels by cubic B-splines.
 
 Level l has nodes 2^l pixels apart, in blocks of 16 x 16 for each region, only where the region has tiles; level 0 are
-the pixels. All kernels but `reference` and the ONNX decoders use it; docs/performance.md has the formulas and errors.
+the pixels. `cpu` and the ONNX decoders use it; docs/performance.md has the formulas and errors.
 """
 
 from __future__ import annotations
 
-import functools
 from typing import NamedTuple
 
 import torch
@@ -54,17 +53,11 @@ def max_spacing(cutoff: float) -> float:
     return min(_SPACING * float(cutoff**0.25), _MAX_SPACING)
 
 
-def blocks_of(membership: Membership | None, size: tuple[int, int], device: torch.device) -> Blocks:
-    """Return the blocks of a map, or of one region everywhere, made once and kept."""
+def blocks_of(membership: Membership | None, size: tuple[int, int]) -> Blocks:
+    """Return the blocks of a map, or of one region everywhere."""
     if membership is None:
-        return _blocks_without_map(size, device)
-    return membership.derived("blocks", lambda m: make_blocks(m.tiles(TILE).keys, m.num_regions, m.index.shape))
-
-
-@functools.lru_cache(maxsize=4)
-def _blocks_without_map(size: tuple[int, int], device: torch.device) -> Blocks:
-    tiles = -(-size[0] // TILE) * -(-size[1] // TILE)
-    return make_blocks(torch.arange(tiles, device=device), 1, (1, *size))
+        return make_blocks(torch.arange(-(-size[0] // TILE) * -(-size[1] // TILE)), 1, (1, *size))
+    return make_blocks(membership.tiles(TILE).keys, membership.num_regions, membership.index.shape)
 
 
 def grids_of(size: tuple[int, int], maps: int) -> tuple[Grid, ...]:
@@ -152,17 +145,3 @@ def coarsen(level: Tensor, means: Tensor, cholesky: Tensor) -> Coarsened:
     c22 = (l22 * l22 - variance * (1 + l21 * l21 / square)).sqrt()
     factors = torch.stack([c11, l11 * l21 / c11, c22], -1) / h
     return Coarsened(level, means / h + 1.5, factors, l11 * l22 / (c11 * c22))
-
-
-def uncoarsen(
-    fine: Tensor, coarse: Coarsened, means: Tensor, cholesky: Tensor, factor: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Turn gradients of what `coarsen` returned, in float64, into those of its means and factors; these were `fine`."""
-    h = (1 << coarse.level).double()[:, None]
-    l11, l21, l22 = fine.unbind(-1)
-    (c11, _, c22), (g11, g21, g22) = (coarse.cholesky * h).unbind(-1), (cholesky / h).unbind(-1)
-    scaled, shift = factor * coarse.factor, h[:, 0] ** 2 / 3 * l21 / (c11 * c11)
-    last = (g22 - scaled / c22) / c22
-    first = (g11 - scaled / c11) * l11 - g21 * shift + last * shift * l21 * l11 / c11
-    rows = [scaled / l11 + first / c11, g21 * l11 / c11 - last * shift, scaled / l22 + last * l22]
-    return means / h, torch.stack(rows, -1)

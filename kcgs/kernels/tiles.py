@@ -36,7 +36,7 @@ def grid_of(inputs: SplatInputs) -> TileGrid:
 
 
 def bounding_tiles(
-    means: Tensor, cholesky: Tensor, radius: float, size: tuple[int, int] | Tensor, *, between: bool = False
+    means: Tensor, cholesky: Tensor, radius: float, size: tuple[int, int], *, between: bool = False
 ) -> tuple[Tensor, Tensor, Tensor]:
     """List the tiles that the bounding box of each float64 Gaussian's support touches.
 
@@ -44,7 +44,7 @@ def bounding_tiles(
         means: (N, 2) pixels.
         cholesky: (N, 3) pixels.
         radius: of the support, in standard deviations.
-        size: of the image, or of each Gaussian's grid, (N, 2).
+        size: of the image.
         between: whether to touch is to hold any point of a tile, rather than the centre of one of its pixels.
 
     Returns:

@@ -9,10 +9,8 @@ import torch
 from torch import Tensor
 
 from kcgs.kernels import Membership, SplatInputs, reference
-from kcgs.kernels.coarse_grids import choose_levels, coarsen, grids_of, max_spacing, uncoarsen
+from kcgs.kernels.coarse_grids import choose_levels, coarsen, grids_of, max_spacing
 from kcgs.kernels.cpu import kernel as cpu
-from kcgs.kernels.pairs import list_pairs
-from kcgs.kernels.splines import gather, sample
 
 CUTOFF = 1e-4
 
@@ -150,39 +148,6 @@ def test_narrow_gaussians_have_no_grids() -> None:
     assert not has_nodes(inputs._replace(cholesky=torch.tensor([1.9, 0.0, 1.9]).expand(1, 40, 3)))
 
 
-def test_gather_is_the_transpose_of_sample() -> None:
-    inputs = make_inputs((150, 110), batch=2, maps=1, softness=0.7)
-    pairs = list_pairs(inputs)
-    assert pairs.wide is not None and inputs.membership is not None
-    plan, masks = pairs.wide.nodes, inputs.membership.tiles(16).masks
-    assert any(step.masks is not None for step in plan.samples)
-    nodes, pixels = (
-        torch.randn(k, 2, 16, 16, dtype=torch.float64) for k in (plan.num_live + 1, pairs.num_tiles - plan.num_live - 1)
-    )
-    nodes[-1] = 0.0
-    back, tiles = gather(pixels, plan, masks), torch.zeros_like(pixels)
-    want = (nodes[:-1] * back[:-1]).sum()
-    sample(nodes, plan, masks, tiles)
-    torch.testing.assert_close((tiles * pixels).sum(), want, rtol=1e-12, atol=0)
-
-
-def test_splines_of_one_are_one() -> None:
-    inputs = make_inputs((150, 110))._replace(cholesky=torch.tensor([1e3, 0.0, 1e3]).expand(1, 40, 3))
-    pairs = list_pairs(inputs)
-    assert pairs.wide is not None
-    # nodes of the coarsest grid alone
-    plan, levels = pairs.wide.nodes, len(grids_of(inputs.size, 1))
-    assert pairs.wide.gaussians.level.unique().tolist() == [levels - 1]
-    nodes = torch.zeros(plan.num_live + 1, 1, 16, 16, dtype=torch.float64)
-    finer = torch.cat([step.blocks for step in plan.refinements])
-    coarsest = torch.ones(plan.num_live, dtype=torch.bool).index_fill(0, finer, False)
-    nodes[:-1][coarsest] = 1.0
-    tiles = torch.zeros(pairs.num_tiles - plan.num_live - 1, 1, 16, 16, dtype=torch.float64)
-    sample(nodes, plan, None, tiles)
-    seen = tiles.view(10, 7, 16, 16).transpose(1, 2).reshape(160, 112)[:150, :110]
-    torch.testing.assert_close(seen, torch.ones_like(seen), rtol=1e-14, atol=0)
-
-
 def test_levels_by_the_axes_of_the_ellipse() -> None:
     generator = torch.Generator().manual_seed(0)
     cholesky = torch.exp2(8 * torch.rand(500, 3, generator=generator, dtype=torch.float64) - 1)
@@ -193,14 +158,3 @@ def test_levels_by_the_axes_of_the_ellipse() -> None:
     levels = choose_levels(cholesky, max_spacing(CUTOFF), 6)
     assert torch.equal(levels, torch.stack(fits).sum(0)) and levels.unique().tolist() == list(range(6))
     assert not choose_levels(cholesky, max_spacing(0.0), 6).any()
-
-
-def test_gradients_of_coarsened_gaussians() -> None:
-    generator = torch.Generator().manual_seed(0)
-    given = [10 + 90 * torch.rand(20, n, generator=generator, dtype=torch.float64) for n in (2, 3)]
-    leaves = [t.clone().requires_grad_() for t in given]
-    coarse = coarsen(torch.arange(20) % 3 + 1, *leaves)
-    grads = [torch.randn(t.shape, generator=generator, dtype=torch.float64) for t in coarse[1:]]
-    want = torch.autograd.grad(coarse[1:], leaves, grads)
-    got = uncoarsen(given[1], coarse, *grads)
-    torch.testing.assert_close(got, want, rtol=1e-10, atol=1e-12)

@@ -57,7 +57,7 @@ def sum_terms(lists, backward, terms, begin, end):  # type: ignore[no-untyped-de
 
 @inner
 def _uncoarsen(g, fine, mean, factor, by_factor):  # type: ignore[no-untyped-def]
-    """Turn the gradients of a mean and a factor on their level into those in pixels, as coarse_grids.uncoarsen does.
+    """Turn the gradients of a mean and a factor on their level into those in pixels, back through coarse_grids.coarsen.
 
     `fine` is the factor in pixels, `by_factor` the gradient of COLOR_FACTOR.
     """

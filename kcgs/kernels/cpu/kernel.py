@@ -95,7 +95,7 @@ def _table_without_map(size: tuple[int, int]) -> Table:
 
 
 def _table(membership: Membership | None, size: tuple[int, int]) -> Table:
-    blocks = blocks_of(membership, size, torch.device("cpu"))
+    blocks = blocks_of(membership, size)
     keys, num_regions, num_maps = blocks.keys.numpy(), 1, 1
     mask_rows, masks = np.full(blocks.first, -1), np.zeros(1, np.float32)
     if membership is not None:

@@ -232,7 +232,7 @@ def _fill(g, mean, cholesky, levels, spacing):  # type: ignore[no-untyped-def]
 def _coarsen(g, spacing, levels):  # type: ignore[no-untyped-def]
     """Move a Gaussian to its level.
 
-    coarse_grids.choose_levels and coarsen in scalars, since numba compiles no torch; test_backends_agree compares them.
+    coarse_grids.choose_levels and coarsen in scalars, since numba compiles no torch; test_coarse_grids compares them.
     """
     # of the variances along the axes of the ellipse: their sum, and their product
     total, product = g[L11] * g[L11] + g[L21] * g[L21] + g[L22] * g[L22], g[L11] * g[L22] * g[L11] * g[L22]
