@@ -87,8 +87,8 @@ def _gather(  # type: ignore[no-untyped-def]
         sums = ()
         for c in tl.static_range(BLOCK):
             known = pair < tl.where(base + c < channels, end, first)
-            color += (tl.load(colors + gaussian * channels + base + c, mask=known, other=0.0),)
-            sums += (tl.zeros([PIECE * _PARTS], tl.float32),)
+            color += (tl.load(colors + gaussian * channels + base + c, mask=known, other=0.0),)  # type: ignore[assignment]
+            sums += (tl.zeros([PIECE * _PARTS], tl.float32),)  # type: ignore[assignment]
         corner = grad + ((image * channels + base) * height + top + first_row) * width + left
         for row in range(SIDE // _PARTS):
             y = (first_row + row) - (SIDE - 1) / 2
@@ -101,7 +101,7 @@ def _gather(  # type: ignore[no-untyped-def]
                 for c in tl.static_range(BLOCK):
                     in_range = first_row + row < tl.where(base + c < channels, height - top, 0)
                     local = tl.load(corner + (c * area + row * width + column), mask=in_range, other=0.0)
-                    added += (sums[c] + local * weight,)
+                    added += (sums[c] + local * weight,)  # type: ignore[assignment]
                     product += local * color[c]
                 sums = added
                 if GEOMETRY:

@@ -70,8 +70,8 @@ def _render(  # type: ignore[no-untyped-def]
     x, y = across - (SIDE - 1) / 2, down - (SIDE - 1) / 2
     base = tl.program_id(1) * BLOCK
     value = ()
-    for c in tl.static_range(BLOCK):
-        value += (tl.zeros([SIDE * SIDE], tl.float32),)
+    for _ in tl.static_range(BLOCK):
+        value += (tl.zeros([SIDE * SIDE], tl.float32),)  # type: ignore[assignment]
     first = tl.load(lists + num_cells + tile)
     count = tl.load(lists + 2 * num_cells + num_tiles + tile)
     k = coefficients + first.to(tl.int64) * 5
@@ -83,7 +83,7 @@ def _render(  # type: ignore[no-untyped-def]
         color = colors + tl.load(slots + room + pair).to(tl.int64) * channels + base
         added = ()
         for c in tl.static_range(BLOCK):
-            added += (value[c] + tl.load(color + c, mask=base + c < channels, other=0.0) * weight,)
+            added += (value[c] + tl.load(color + c, mask=base + c < channels, other=0.0) * weight,)  # type: ignore[assignment]
         value = added
         k += 5
 
@@ -93,7 +93,7 @@ def _render(  # type: ignore[no-untyped-def]
     for c in tl.static_range(BLOCK):
         place = ((plane + c) * height + row) * width + column
         inside = (row < tl.where(base + c < channels, height, 0)) & (column < width)
-        result = value[c]
+        result = value[c]  # type: ignore[assignment]
         if target is not None:
             result -= tl.load(target + place, mask=inside, other=0.0)
         tl.store(image + place, tl.where(failed, float("nan"), result), mask=inside)
