@@ -70,7 +70,7 @@ def _render(  # type: ignore[no-untyped-def]
     x, y = across - (SIDE - 1) / 2, down - (SIDE - 1) / 2
     base = tl.program_id(1) * BLOCK
     value = ()
-    for _ in tl.static_range(BLOCK):
+    for _channel in tl.static_range(BLOCK):
         value += (tl.zeros([SIDE * SIDE], tl.float32),)  # type: ignore[assignment]
     first = tl.load(lists + num_cells + tile)
     count = tl.load(lists + 2 * num_cells + num_tiles + tile)
@@ -93,7 +93,7 @@ def _render(  # type: ignore[no-untyped-def]
     for c in tl.static_range(BLOCK):
         place = ((plane + c) * height + row) * width + column
         inside = (row < tl.where(base + c < channels, height, 0)) & (column < width)
-        result = value[c]  # type: ignore[assignment]
+        result = value[c]  # type: ignore[var-annotated]
         if target is not None:
             result -= tl.load(target + place, mask=inside, other=0.0)
         tl.store(image + place, tl.where(failed, float("nan"), result), mask=inside)
