@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
-import triton
 import triton.language as tl
 from torch import Tensor
 
+from kcgs.kernels.cuda.program import program
+
 # pixels of a program
 _PIXELS = 512
-_OPTIONS = {"num_warps": 4, "enable_fp_fusion": True}
 
 
 def blur(planes: Tensor, labels: Tensor | None, sigma: float, norm_sigma: float, reach: int) -> Tensor:
@@ -29,20 +27,17 @@ def blur(planes: Tensor, labels: Tensor | None, sigma: float, norm_sigma: float,
         blurred = torch.empty_like(planes)
         with torch.cuda.device_of(planes):
             # without labels any address will do: it is not read
-            _blur[(-(-height * width // _PIXELS), count)](
+            _blur(
+                (-(-height * width // _PIXELS), count),
                 planes, planes if labels is None else labels, blurred, height * width, stride, length,
-                -0.5 / sigma**2, -0.5 / norm_sigma**2, reach, MAPPED=labels is not None, PIXELS=_PIXELS, **_OPTIONS,
+                -0.5 / sigma**2, -0.5 / norm_sigma**2, reach, MAPPED=labels is not None,
+                PIXELS=_PIXELS,
             )  # fmt: skip
         planes = blurred
     return planes
 
 
-def _program(function: Any) -> Any:
-    """Decorate a program to be compiled once for all sizes."""
-    return triton.jit(function, do_not_specialize=["area", "stride", "length", "reach"])
-
-
-@_program
+@program(warps=4)
 def _blur(  # type: ignore[no-untyped-def]
     planes, labels, blurred, area, stride, length, exponent, norm_exponent, reach,
     MAPPED: tl.constexpr, PIXELS: tl.constexpr,

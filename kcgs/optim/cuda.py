@@ -5,16 +5,17 @@ Numbers in between are float64, as in `loops.py`. A Gaussian with a gradient tha
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
+from kcgs.kernels.cuda.program import program
+
 # Gaussians of a program
 _ROWS = 128
-_OPTIONS = {"num_warps": 4, "enable_fp_fusion": True}
 
 
 class Adam(NamedTuple):
@@ -57,20 +58,16 @@ def step(tables: list[Tensor], gradients: list[Tensor | None], geometry: Adam, c
     addresses = [table if gradient is None else gradient for table, gradient in zip(tables, gradients, strict=True)]
     opacities = tables[3:] or tables[:1]
     with torch.cuda.device_of(tables[0]):
-        _step[(-(-count // _ROWS),)](
+        _step(
+            (-(-count // _ROWS),),
             *tables[:3], *opacities, *addresses[:3], *(addresses[3:] or tables[:1]), *geometry, *colors, *bounds, count,
             CHANNELS=channels, COLUMNS=channels + len(tables[3:]), MEANS=has_gradient[0], CHOLESKY=has_gradient[1],
             COLORS=has_gradient[2], OPACITIES=has_gradient[3], LR_LOADED=isinstance(geometry.lr, Tensor),
-            COLOR_LR_LOADED=isinstance(colors.lr, Tensor), ROWS=_ROWS, **_OPTIONS,
+            COLOR_LR_LOADED=isinstance(colors.lr, Tensor), ROWS=_ROWS,
         )  # fmt: skip
 
 
-def _jit(function: Any) -> Any:
-    """Decorate a function to be compiled once for any number of Gaussians."""
-    return triton.jit(function, do_not_specialize=["count"])
-
-
-@_jit
+@triton.jit  # type: ignore[untyped-decorator]
 def _gradient(gradients, place, mask, EXISTS: tl.constexpr):  # type: ignore[no-untyped-def]
     if EXISTS:
         return tl.load(gradients + place, mask=mask, other=0.0).to(tl.float64)
@@ -78,7 +75,7 @@ def _gradient(gradients, place, mask, EXISTS: tl.constexpr):  # type: ignore[no-
         return tl.zeros_like(place).to(tl.float64)
 
 
-@_jit
+@triton.jit  # type: ignore[untyped-decorator]
 def _rate(lr, beta1, beta2, age, LOADED: tl.constexpr):  # type: ignore[no-untyped-def]
     """Return the learning rate over the first average's correction, and the inverse root of the second one's."""
     if LOADED:
@@ -88,7 +85,7 @@ def _rate(lr, beta1, beta2, age, LOADED: tl.constexpr):  # type: ignore[no-untyp
     return lr / (1.0 - power1), 1.0 / tl.sqrt(1.0 - power2)
 
 
-@_jit
+@triton.jit
 def _move(gradient, averages, squares, place, mask, rate, root, beta1, beta2, eps):  # type: ignore[no-untyped-def]
     """Update the averages of a column, and return Adam's step."""
     average = tl.load(averages + place, mask=mask, other=0.0).to(tl.float64)
@@ -100,24 +97,24 @@ def _move(gradient, averages, squares, place, mask, rate, root, beta1, beta2, ep
     return -rate * average / (root * tl.sqrt(square) + eps)
 
 
-@_jit
+@triton.jit
 def _clamp(value, low, high):  # type: ignore[no-untyped-def]
     return tl.where(value < low, low, tl.where(value > high, high, value))  # NaN stays NaN
 
 
-@_jit
+@triton.jit
 def _store(table, place, value, mask):  # type: ignore[no-untyped-def]
     """Write numbers, but none that is not finite in float32."""
     value = value.to(tl.float32)
     tl.store(table + place, value, mask=mask & (tl.abs(value) < float("inf")))
 
 
-@_jit
+@triton.jit
 def _add(table, place, change, mask):  # type: ignore[no-untyped-def]
     _store(table, place, tl.load(table + place, mask=mask, other=0.0) + change, mask)
 
 
-@_jit
+@program(warps=4)
 def _step(  # type: ignore[no-untyped-def]
     means, cholesky, colors, opacities, means_gradient, cholesky_gradient, colors_gradient, opacities_gradient,
     lr, beta1, beta2, eps, age, average, square,

@@ -231,6 +231,6 @@ class TestTriton:
         constants = {"MAPPED": has_labels, "PIXELS": cuda._PIXELS}
         types = {**dict.fromkeys(constants, "constexpr"), **dict.fromkeys(("area", "stride", "length", "reach"), "i32")}
         types |= dict.fromkeys(("exponent", "norm_exponent"), "fp32")
-        signature = {name: types.get(name, "*fp32") for name in cuda._blur.arg_names}
-        source = triton.compiler.ASTSource(cuda._blur, signature, constants)
-        triton.compile(source, target=GPUTarget("cuda", capability, 32), options=cuda._OPTIONS)
+        signature = {name: types.get(name, "*fp32") for name in cuda._blur.jit.arg_names}
+        source = triton.compiler.ASTSource(cuda._blur.jit, signature, constants)
+        triton.compile(source, target=GPUTarget("cuda", capability, 32), options=cuda._blur.options)

@@ -107,7 +107,7 @@ def test_auto(installed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_missing_triton(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cuda, "find_spec", lambda _: None)
+    monkeypatch.setattr(cuda, "_has_triton", lambda: False)
     on_a_gpu = inputs()._replace(means=SimpleNamespace(dtype=torch.float32, device=torch.device("cuda")))
     with pytest.raises(ImportError, match="backend 'cuda' needs Triton: pip install triton"):
         cuda.steps(on_a_gpu)
@@ -117,7 +117,7 @@ def test_auto_says_why_it_takes_tiled(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise RuntimeError("no C compiler")
 
-    monkeypatch.setattr(registry, "prepare", fail)
+    monkeypatch.setattr(registry, "_try", fail)
     registry._compiles.cache_clear()
     with pytest.warns(UserWarning, match="'auto' takes 'tiled' on cuda, which is slower: RuntimeError: no C compiler"):
         assert registry._choose("auto", torch.device("cuda"), torch.float32) == "tiled"

@@ -56,9 +56,9 @@ def test_compiles_without_a_gpu(
     constants["ROWS"] = cuda._ROWS
     types = {**dict.fromkeys(NUMBERS, "fp32"), **dict.fromkeys(("lr", "color_lr"), rate), "count": "i32"}
     types |= dict.fromkeys(constants, "constexpr")
-    signature = {name: types.get(name, "*fp32") for name in cuda._step.arg_names}
-    source = triton.compiler.ASTSource(cuda._step, signature, constants)
-    ptx = triton.compile(source, target=GPUTarget("cuda", capability, 32), options=cuda._OPTIONS).asm["ptx"]
+    signature = {name: types.get(name, "*fp32") for name in cuda._step.jit.arg_names}
+    source = triton.compiler.ASTSource(cuda._step.jit, signature, constants)
+    ptx = triton.compile(source, target=GPUTarget("cuda", capability, 32), options=cuda._step.options).asm["ptx"]
     assert "sqrt.rn.f64" in ptx
     # no Gaussian knows of another
     assert not re.search(r"\b(atom|red|shfl|bar)\.", ptx)

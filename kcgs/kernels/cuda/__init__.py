@@ -6,6 +6,7 @@ memory is reserved by an atomic addition; no sum is: each has one owner and one 
 
 from __future__ import annotations
 
+import functools
 from importlib.util import find_spec
 
 import torch
@@ -13,12 +14,17 @@ import torch
 from ..interface import SplatInputs, Steps
 
 
+@functools.cache
+def _has_triton() -> bool:
+    return find_spec("triton") is not None
+
+
 def steps(inputs: SplatInputs) -> Steps:
     """Return the kernel, if it takes these inputs."""
     dtype, device = inputs.means.dtype, inputs.means.device
     if dtype != torch.float32:
         raise ValueError(f"backend 'cuda' computes in float32; got {dtype}: use 'tiled' or 'reference'")
-    if find_spec("triton") is None:
+    if not _has_triton():
         raise ImportError("backend 'cuda' needs Triton: pip install triton")
     from .gather import differentiate, error_gradients
     from .plan import plan

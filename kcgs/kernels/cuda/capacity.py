@@ -1,6 +1,7 @@
 """Room for the lists of a plan where nothing may wait for the device: in a CUDA graph, and from step to step of a fit.
 
-An eager call waits for the number of slots. Elsewhere there is room for 1.5 times the most that was seen for the size.
+An eager call waits for the number of slots. Elsewhere there is room for 1.5 times the most that was seen for the size,
+and some more.
 What does not fit, or is not finite, gives NaN, and is noted on the device; whoever waits next reads the note.
 """
 
@@ -17,7 +18,8 @@ from kcgs._warn import warn_user
 
 from ..interface import SplatInputs
 
-_ROOM = 1.5
+# slots beyond the most: a factor, and a number, since few wide Gaussians grow fastest
+_ROOM, _LEAST_ROOM = 1.5, 1 << 16
 
 # slots of the largest plan of a device, a number of images and a size
 _most: dict[tuple[torch.device, int, tuple[int, int]], int] = {}
@@ -48,7 +50,7 @@ def reserve(inputs: SplatInputs) -> int | None:
             f"region_splat of {images} x {height} x {width} cannot be captured before it was rendered once: the room "
             "for its lists is not known; call it before the capture, with Gaussians as large as there will be"
         )
-    return None if most is None else int(_ROOM * most) + 1
+    return None if most is None else int(_ROOM * most) + _LEAST_ROOM
 
 
 def remember(inputs: SplatInputs, slots: int) -> None:

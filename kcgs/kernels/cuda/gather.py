@@ -37,7 +37,7 @@ def differentiate(plan: Plan, inputs: SplatInputs, grad: Tensor, geometry: bool)
         _gather(
             (num_pieces,), terms, grad.contiguous(), colors, plan.pieces, num_pieces,
             *lists_of(plan, inputs), *inputs.size, channels,
-            BLOCK=channels_at_once(channels), MAPPED=inputs.coverage is not None, GEOMETRY=geometry,
+            BLOCK=channels_at_once(channels), MAPPED=plan.weights is not None, GEOMETRY=geometry,
         )  # fmt: skip
         _reduce(
             (total,), terms, cholesky, plan.counters, plan.gaussians, plan.slots, means_grad, cholesky_grad, grads[-1],

@@ -55,6 +55,7 @@ class Plan(NamedTuple):
     slots: Tensor  # [4, S] int32: entries of cells; Gaussians of pairs, and their planes; pairs of slots, -1: none
     coefficients: Tensor  # [S, 5] float32, of pairs: see tiles.coefficients, times SCALE
     pieces: Tensor  # [2, P] int32: a tile, and the first of up to 8 of its pairs
+    weights: Tensor | None  # of the map's coverage
     grid: TileGrid
     num_cells: int
     foreign: int  # Gaussians whose region id the map does not hold, where the plan waited for the device
@@ -77,10 +78,10 @@ def plan(inputs: SplatInputs) -> Plan | None:
     counters = torch.zeros(_COUNTERS, dtype=torch.int64, device=device)
     gaussians = torch.empty(4, total, dtype=torch.int32, device=device)
     ids, coverage = inputs.ids, inputs.coverage
-    num_ids, map_tiles, starts, regions, planes = 0, 1, None, None, None
+    num_ids, map_tiles, starts, regions, planes, weights = 0, 1, None, None, None, None
     if ids is not None and coverage is not None:
         num_ids, map_tiles = len(ids), len(coverage.starts) - 1
-        starts, regions, planes, _ = coverage
+        starts, regions, planes, weights = coverage
     with torch.cuda.device_of(means):
         _prepare(
             (-(-total // _PREPARE_BLOCK),),
@@ -110,7 +111,7 @@ def plan(inputs: SplatInputs) -> Plan | None:
             map_tiles, total, room, num_cells, grid.total, grid.rows, grid.cols, cell_rows, cell_cols, pieces.shape[1],
             radius, MAPPED=num_ids > 0, BLOCK=_TILE_BLOCK,
         )  # fmt: skip
-    return Plan(counters, gaussians, lists, slots, coefficients, pieces, grid, num_cells, foreign)
+    return Plan(counters, gaussians, lists, slots, coefficients, pieces, weights, grid, num_cells, foreign)
 
 
 @program(warps=4)

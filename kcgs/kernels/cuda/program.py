@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -36,6 +37,7 @@ def program(warps: int) -> Callable[[Any], Program]:
     return lambda function: Program(function, warps)
 
 
+@functools.cache
 def is_interpreted() -> bool:
     """Whether TRITON_INTERPRET=1 was set when triton was imported: programs run in numpy, on CPU tensors."""
-    return not isinstance(triton.jit(is_interpreted), triton.JITFunction)
+    return not isinstance(triton.jit(program), triton.JITFunction)

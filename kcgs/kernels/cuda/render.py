@@ -32,15 +32,14 @@ def render(plan: Plan, inputs: SplatInputs, target: Tensor | None = None) -> Ten
         _render(
             (grid.total, triton.cdiv(channels, block)),
             image, None if target is None else target.contiguous(), inputs.colors.contiguous(), *lists_of(plan, inputs),
-            height, width, channels, BLOCK=block, MAPPED=inputs.coverage is not None,
+            height, width, channels, BLOCK=block, MAPPED=plan.weights is not None,
         )  # fmt: skip
     return image
 
 
 def lists_of(plan: Plan, inputs: SplatInputs) -> tuple[Any, ...]:
     """Return what the programs of image and gradients read of a plan and a map."""
-    grid, weights = plan.grid, None if inputs.coverage is None else inputs.coverage.weights
-    arrays = plan.counters, plan.lists, plan.slots, plan.coefficients, weights
+    grid, arrays = plan.grid, (plan.counters, plan.lists, plan.slots, plan.coefficients, plan.weights)
     return *arrays, plan.room, plan.num_cells, grid.total, grid.rows, grid.cols, max(inputs.cutoff, _LEAST_WEIGHT)
 
 
