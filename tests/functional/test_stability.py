@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -11,8 +12,23 @@ from torch import Tensor
 from kcgs import RegionMap
 from kcgs.functional import region_splat, scale_rotation_to_cholesky
 
-FAST = ["tiled", "cpu"]
+FAST = ["tiled", "cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 SIZE = (40, 50)
+
+
+def splat(
+    scene: list[Tensor],
+    ids: Tensor | None = None,
+    regions: RegionMap | Tensor | None = None,
+    *,
+    backend: str,
+    **settings: Any,
+) -> Tensor:
+    """Render on the backend's device; tensors come from the CPU, and so does the image."""
+    device = "cuda" if backend == "cuda" else "cpu"
+    regions = None if regions is None else regions.to(device)
+    ids = None if ids is None else ids.to(device)
+    return region_splat(*(t.to(device) for t in scene), ids, regions, backend=backend, **settings).cpu()
 
 
 def render(
@@ -21,7 +37,7 @@ def render(
     """Return the image and the gradients, of the reference in float64, of others in float32."""
     inputs = [t.detach().to(torch.float64 if backend == "reference" else torch.float32) for t in scene]
     size = SIZE if regions is None else None
-    image = region_splat(*(t.requires_grad_() for t in inputs), ids, regions, size=size, cutoff=0, backend=backend)
+    image = splat([t.requires_grad_() for t in inputs], ids, regions, size=size, cutoff=0, backend=backend)
     probe = torch.cos(torch.linspace(0, 60, image.numel(), dtype=torch.float64)).view_as(image)
     (image.double() * probe).sum().backward()
     assert torch.isfinite(image).all()
@@ -85,13 +101,14 @@ def test_centres_far_away(backend: str, distance: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("backend", "dtype"), [("tiled", torch.float32), ("tiled", torch.float64), ("cpu", torch.float32)]
+    ("backend", "dtype"),
+    [("tiled", torch.float32), ("tiled", torch.float64), *((name, torch.float32) for name in FAST[1:])],
 )
 def test_weights_that_are_nothing(backend: str, dtype: torch.dtype) -> None:
     """Below e^-80, in float64 e^-700, a weight is 0, whatever it is multiplied by."""
     scene = [torch.full((1, 2), 0.5), torch.tensor([[0.2, 0.0, 0.2]]), torch.full((1, 1), 1e30)]
     leaves = [t.to(dtype).requires_grad_() for t in scene]
-    image = region_splat(*leaves, size=(16, 16), cutoff=0, backend=backend)
+    image = splat(leaves, size=(16, 16), cutoff=0, backend=backend)
     far = image[:, 8:, 8:]
     assert image.any() and not far.any()
     assert not any(gradient.any() for gradient in torch.autograd.grad(far.sum(), leaves))
@@ -110,7 +127,7 @@ def test_shapes(size: tuple[int, int], count: int) -> None:
     for softness in (0.0, 0.7):
         regions = RegionMap.from_labels(labels, softness)
         if not count:
-            assert all(not region_splat(*scene, ids, regions, backend=backend).any() for backend in FAST)
+            assert all(not splat(scene, ids, regions, backend=backend).any() for backend in FAST)
             continue
         expected = render("reference", scene, ids, regions)  # once for all: on so many pixels it takes seconds
         for backend in FAST:
@@ -126,9 +143,8 @@ def test_65535_regions_of_a_few_pixels(backend: str) -> None:
     generator = torch.Generator().manual_seed(0)
     means = torch.stack([2.0 * (ids % 256) + 1, ids // 256 + 0.5], -1)
     colors = torch.rand(len(ids), 1, generator=generator)
-    image = region_splat(
-        means, torch.tensor([[4.0, 0.0, 4.0]]).repeat(len(ids), 1), colors, ids, labels, backend=backend
-    )
+    cholesky = torch.tensor([[4.0, 0.0, 4.0]]).repeat(len(ids), 1)
+    image = splat([means, cholesky, colors], ids, labels, backend=backend)
     painted = torch.zeros(65_535).index_put((ids,), colors[:, 0])
     expected = painted[labels[0, ::2]] * math.exp(-0.5 * (0.5 / 4) ** 2)
     torch.testing.assert_close(image[0, 0, ::2], expected, rtol=1e-3, atol=1e-6)
@@ -140,7 +156,7 @@ def test_8k_image(backend: str) -> None:
     height, width = 4320, 7680
     means = torch.tensor([[7000.3, 4000.7], [100.0, 4319.5], [3840.0, 2160.0]])
     cholesky = torch.tensor([[30.0, 10.0, 20.0], [50.0, 0.0, 3.0], [400.0, -300.0, 200.0]])
-    image = region_splat(means, cholesky, torch.ones(3, 1), size=(height, width), backend=backend)
+    image = splat([means, cholesky, torch.ones(3, 1)], size=(height, width), backend=backend)
     assert torch.isfinite(image).all()
     for (mx, my), factor in zip(means.double(), cholesky.double(), strict=True):
         x, y = int(mx), min(int(my), height - 1)
@@ -161,7 +177,7 @@ def test_error_at_the_default_cutoff(backend: str) -> None:
     images, grads = [], []
     for name, cutoff, dtype in ((backend, 1e-4, torch.float32), ("reference", 0.0, torch.float64)):
         inputs = [t.detach().clone().to(dtype).requires_grad_() for t in scene]
-        image = region_splat(*inputs, size=(90, 120), cutoff=cutoff, backend=name)
+        image = splat(inputs, size=(90, 120), cutoff=cutoff, backend=name)
         (image * torch.cos(torch.linspace(0, 60, image.numel(), dtype=dtype)).view_as(image)).sum().backward()
         images.append(image.detach().double())
         grads.append([t.grad.double() for t in inputs if t.grad is not None])

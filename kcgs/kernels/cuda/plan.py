@@ -276,7 +276,8 @@ def _tile(  # type: ignore[no-untyped-def]
         # from the mean to the tile's centre; z1 is bounded by the box, and here the least z2 over the tile
         x = column * SIDE + SIDE / 2 - x
         y = row * SIDE + SIDE / 2 - y
-        slope = l21 / l11
+        inverse1, inverse2 = 1 / l11, 1 / l22
+        slope = l21 * inverse1
         nearest = tl.abs(y - slope * x) - (SIDE - 1) / 2 * (1 + tl.abs(slope))
         keeps &= nearest <= radius * _REACH * l22 + _MARGIN
         rank = tl.cumsum(keeps.to(tl.int32), axis=0)
@@ -285,11 +286,11 @@ def _tile(  # type: ignore[no-untyped-def]
         if MAPPED:
             tl.store(slots + 2 * room + pair, plane, mask=keeps)
         address = coefficients + pair.to(tl.int64) * 5
-        _store(address, x / l11, keeps)
-        _store(address + 1, 1 / l11, keeps)
-        _store(address + 2, (y - slope * x) / l22, keeps)
-        _store(address + 3, -slope / l22, keeps)
-        _store(address + 4, 1 / l22, keeps)
+        _store(address, x * inverse1, keeps)
+        _store(address + 1, inverse1, keeps)
+        _store(address + 2, (y - slope * x) * inverse2, keeps)
+        _store(address + 3, -slope * inverse2, keeps)
+        _store(address + 4, inverse2, keeps)
         slot = tl.load(gaussians + 2 * total + g, mask=holds, other=0) + (row - y0) * (x1 - x0 + 1) + column - x0
         tl.store(slots + 3 * room + slot, tl.where(keeps, pair, -1), mask=holds)
         place += tl.sum(keeps.to(tl.int32), axis=0)
