@@ -107,13 +107,15 @@ def fit_and_save(
     target_psnr = config.target_psnr
     if target_psnr is not None and is_compressed:
         config = config.model_copy(update={"target_psnr": target_psnr + _ROUNDING_MARGIN})
+    device = request.load_device()
+    on_device = image.to(device), None if labels is None else labels.to(device)
     start = time.perf_counter()
     settings: Any = {"recipe": config, "seed": request.seed, "on_step": on_step, "progress": progress}
     if request.target_bytes is not None:
-        file = fit_bytes(image, labels, request.target_bytes, **settings)
+        file = fit_bytes(*on_device, request.target_bytes, **settings)
         result, scene, num_bytes = file.result, file.scene, write_file(output, file.data)
     elif is_compressed:
-        result = fit(image, labels, request.num_gaussians, **settings)
+        result = fit(*on_device, request.num_gaussians, **settings)
         quality = quality_for(max(entry.psnr for entry in result.history)) if target_psnr is None else None
         goal: Any = {
             "quality": quality,
@@ -124,8 +126,8 @@ def fit_and_save(
             compressed = compress(result.scene, image, seed=request.seed, **goal)
         scene, num_bytes = compressed.scene, write_file(output, compressed.data)
     else:
-        result = fit(image, labels, request.num_gaussians, **settings)
-        scene = Scene(result.scene.field, result.scene.regions, {"recipe": request.recipe})
+        result = fit(*on_device, request.num_gaussians, **settings)
+        scene = Scene(result.scene.field, result.scene.regions, {"recipe": request.recipe}).to("cpu")
         num_bytes = scene.save(output)
     return SavedFit(result, scene, num_bytes, time.perf_counter() - start)
 

@@ -11,6 +11,8 @@ import typer
 from kcgs.errors import InvalidArgument
 
 if TYPE_CHECKING:
+    import torch
+
     from kcgs.fitting import FitConfig
     from kcgs.scene import Scene
 
@@ -36,6 +38,8 @@ class FitRequest(NamedTuple):
     settings: dict[str, Any]
     """In place of the recipe's."""
     seed: int
+    device: str
+    """Where it is fitted."""
 
     @property
     def default_suffix(self) -> str:
@@ -47,6 +51,17 @@ class FitRequest(NamedTuple):
         from kcgs.fitting import FitConfig
 
         return FitConfig.from_recipe(self.recipe, **self.settings)
+
+    def load_device(self) -> torch.device:
+        """Return the device; a ValueError says that torch has none of that name."""
+        import torch
+
+        try:
+            device = torch.device(self.device)
+            torch.empty(0, device=device)
+        except (RuntimeError, AssertionError) as error:  # torch without CUDA asserts
+            raise InvalidArgument("device", "one that torch has, such as cpu or cuda", repr(self.device)) from error
+        return device
 
 
 def fit_request(
@@ -72,6 +87,7 @@ def fit_request(
         typer.Option("--keep-contours", help="Keep the label map: no contour moves, no region is merged."),
     ] = False,
     seed: Annotated[int, typer.Option(help="Seed of the random start.")] = 0,
+    device: Annotated[str, typer.Option(help="Where to fit: cpu, or cuda for a GPU.")] = "cpu",
 ) -> FitRequest:
     """Return a request of the options."""
     if target_bytes is not None:
@@ -82,7 +98,7 @@ def fit_request(
     settings = {key: value for key, value in settings.items() if value is not None}
     if keep_contours:
         settings |= {"move_contours": False, "merge_regions": False}
-    return FitRequest(num_gaussians or DEFAULT_GAUSSIANS, target_bytes, recipe, settings, seed)
+    return FitRequest(num_gaussians or DEFAULT_GAUSSIANS, target_bytes, recipe, settings, seed, device)
 
 
 def with_fit_options(command: Callable[..., None], *, without: tuple[str, ...] = ()) -> Callable[..., None]:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from kcgs.scene import Scene
 
 # options of a fit that only make sense for one image
-_SINGLE_IMAGE_OPTIONS = ("max_seconds", "target_psnr", "target_bytes")
+_SINGLE_IMAGE_OPTIONS = ("max_seconds", "target_psnr", "target_bytes", "device")
 
 
 @app.command("fit-video")

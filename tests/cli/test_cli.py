@@ -185,6 +185,11 @@ class TestFailures:
             (("fit", "photo.png", "--target-psnr", "-3"), 2, "'--target-psnr': must be greater than 0; got -3.0"),
             (("fit", "photo.png", "-n", "5", "--target-bytes", "90"), 2, "must be left out with --target-bytes; got 5"),
             (("fit", "photo.png", "--target-bytes", "90", "-o", "a.safetensors"), 2, "must end in .kcgs"),
+            (
+                ("fit", "photo.png", "--regions", "none", "--device", "tpu"),
+                2,
+                "'--device': must be one that torch has, such",
+            ),
             (("fit", "folder"), 2, "'IMAGE': file 'folder' is a directory"),
             (("info", "text.png"), 2, "'SCENE': must end in .safetensors or .kcgs, or be zoo:NAME; got 'text.png'"),
             (("info", "zoo:nothing"), 2, "zoo entry must be one of"),
