@@ -62,7 +62,7 @@ def region_splat(
         ValueError: shapes that do not fit, devices that differ, values that are not finite or out of range.
 
     Warns:
-        UserWarning: Gaussians whose region ids the map does not hold, on the CPU.
+        UserWarning: Gaussians whose region ids the map does not hold.
 
     Example:
         >>> means, cholesky = torch.tensor([[2.5, 0.5]]), torch.tensor([[1.0, 0.0, 1.0]])

@@ -54,7 +54,7 @@ class SplatInputs(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """A kernel: three functions that record no graph, and three optional fields.
+    """A kernel: three functions that record no graph, and what only some kernels have.
 
     plan: from the inputs to which Gaussians touch which pixels, in a form of the kernel's own.
     render: from (plan, inputs) to the image, (B, C, H, W).

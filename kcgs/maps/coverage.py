@@ -138,7 +138,7 @@ class _Members(NamedTuple):
 
     def blur(self, widths: Sequence[float]) -> Tensor:
         """Return the membership of the tiles' pixels in the regions, (P, 256), blurred by one width."""
-        weights = torch.empty(len(self.tiles), TILE * TILE, device=self.tiles.device)
+        weights = torch.empty(len(self.tiles), TILE * TILE, dtype=torch.float32, device=self.tiles.device)
         blurs = _Blurs(self.windows, widths)
         for chunk in _chunks(len(weights), blurs.bytes):
             weights[chunk] = blurs.apply(self.tiles[chunk], self.regions[chunk], torch.zeros_like(self.tiles[chunk]))
@@ -146,7 +146,7 @@ class _Members(NamedTuple):
 
     def blur_by_pixel(self, widths: Sequence[float], tile_widths: _TileWidths, count: int) -> Tensor:
         """Return the same, each pixel blurred by its own width: `count` is the sum of the tiles' numbers of widths."""
-        weights = torch.zeros(len(self.tiles), TILE * TILE, device=self.tiles.device)
+        weights = torch.zeros(len(self.tiles), TILE * TILE, dtype=torch.float32, device=self.tiles.device)
         blurs = _Blurs(self.windows, widths)
         counts = tile_widths.counts[self.tiles]
         plane = torch.repeat_interleave(counts, output_size=count)

@@ -75,11 +75,21 @@ def test_compiles_without_a_gpu(
         compiled = triton.compile(source, target=GPUTarget("cuda", capability, 32), options=kernel.options).asm
         # no sum of values depends on the order in which programs run
         assert not re.search(r"\b(atom|red)\.\S*\.f\d+", compiled["ptx"])
-        binary = tmp_path / "program.cubin"
-        binary.write_bytes(compiled["cubin"])
-        tool = Path(triton.__file__).parent / "backends/nvidia/bin/cuobjdump"
-        usage = subprocess.run([tool, "-res-usage", binary], capture_output=True, text=True, check=True).stdout
-        assert " LOCAL:0 " in usage  # no register is spilled
+        (tmp_path / "program.ptx").write_text(compiled["ptx"])
+        assert "0 bytes spill stores, 0 bytes spill loads" in assemble(tmp_path / "program.ptx", capability)
+
+
+def assemble(ptx: Path, capability: int) -> str:
+    """Return what the assembler says of registers; Triton brings one, or two of which one knows newer versions."""
+    import triton
+
+    folder = Path(triton.__file__).parent / "backends/nvidia/bin"
+    output = ptx.with_suffix(".cubin")
+    runs = [
+        subprocess.run([tool, "-v", f"-arch=sm_{capability}", ptx, "-o", output], capture_output=True, text=True)
+        for tool in sorted(folder.glob("ptxas*"))
+    ]
+    return next(run.stderr for run in runs if run.returncode == 0)
 
 
 def inputs(dtype: torch.dtype = torch.float32) -> SplatInputs:

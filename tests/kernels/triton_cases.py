@@ -31,7 +31,7 @@ def make_inputs(
     size: tuple[int, int] = (16, 20),
     *,
     regions: int = 1,
-    softness: float = 0.0,
+    softness: float | dict[tuple[int, int], float] = 0.0,
     channels: int = 3,
     batch: int = 1,
     maps: int = 1,
@@ -105,6 +105,7 @@ def assert_matches_reference(inputs: SplatInputs, tolerance: float = 5e-6) -> No
         {"size": (15, 17), "regions": 3, "channels": 1, "cutoff": 1e-3},
         {"size": (9, 33), "regions": 3, "softness": 0.7, "batch": 3, "channels": 5, "n": 8},
         {"size": (9, 20), "regions": 2, "softness": 1.5, "batch": 2, "maps": 2, "channels": 9, "n": 6},
+        {"size": (40, 52), "regions": 4, "softness": {(0, 1): 0.6, (1, 3): 2.0}, "batch": 2, "maps": 2, "n": 3},
         *([{"size": (40, 52), "regions": 3, "softness": 0.7, "batch": 3, "maps": 3, "n": 300}] if GPU else []),
         *([{"size": (300, 400), "regions": 3, "n": 700, "batch": 2, "cutoff": 1e-4, "channels": 32}] if GPU else []),
     ],
@@ -213,16 +214,22 @@ def test_without_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
         assert all(t.isfinite().all() for t in evaluate(cuda, large))
         assert not settle(inputs.means.device, inputs.size)
         assert evaluate(cuda, inputs._replace(colors=inputs.colors / 0))[0].isnan().all()
+        evaluate(cuda, inputs)
+    assert settle(inputs.means.device, inputs.size)
+    capacity.notes_of(inputs.means.device)[1] = 1
     with pytest.warns(UserWarning, match="1 renders of a CUDA graph are NaN: their Gaussians were not finite"):
         evaluate(cuda, inputs)
+    evaluate(cuda, inputs)
 
 
 def test_too_many_slots() -> None:
-    inputs = make_inputs(3, size=(1 << 19, 1 << 19))
+    inputs = make_inputs(9, size=(1 << 18, 1 << 18))
     inputs = inputs._replace(cholesky=torch.full_like(inputs.cholesky, 1e6))
-    message = r"3 Gaussians touch 3221225472 tiles of 16 x 16 pixels at 524288 x 524288: more than the device has room"
+    message = r"9 Gaussians touch 2415919104 tiles of 16 x 16 pixels at 262144 x 262144: more than the device has room"
     with pytest.raises(ValueError, match=message):
         plan.plan(inputs)
+    with pytest.raises(ValueError, match=r"size must be at most 524272 on backend 'cuda'; got \(1, 524288\)"):
+        plan.plan(inputs._replace(size=(1, 1 << 19)))
 
 
 # the operator

@@ -1,8 +1,8 @@
 """Room for the lists of a plan where nothing may wait for the device: in a CUDA graph, and from step to step of a fit.
 
 An eager call waits for the number of slots. Elsewhere there is room for 1.5 times the most that was seen for the size,
-and some more.
-What does not fit, or is not finite, gives NaN, and is noted on the device; whoever waits next reads the note.
+and 65,536 more, since few wide Gaussians grow fastest. What does not fit, or is not finite, gives NaN, and is noted
+on the device; whoever waits next reads the note.
 """
 
 from __future__ import annotations
@@ -18,13 +18,15 @@ from kcgs._warn import warn_user
 
 from ..interface import SplatInputs
 
-# slots beyond the most: a factor, and a number, since few wide Gaussians grow fastest
 _ROOM, _LEAST_ROOM = 1.5, 1 << 16
+# they count in 32 bits
+_MOST_SLOTS = (1 << 31) - 1
 
 # slots of the largest plan of a device, a number of images and a size
 _most: dict[tuple[torch.device, int, tuple[int, int]], int] = {}
-# of each device, int64: plans whose lists did not fit, whose values were not finite, and the most slots of one
-_notes: dict[torch.device, Tensor] = {}
+# of each device, int64: plans whose lists did not fit, whose values were not finite, and the most slots of one; False:
+# of plans within `without_waiting`
+_notes: dict[tuple[torch.device, bool], Tensor] = {}
 _waits: ContextVar[bool] = ContextVar("whether plans wait for the device", default=True)
 
 
@@ -50,7 +52,7 @@ def reserve(inputs: SplatInputs) -> int | None:
             f"region_splat of {images} x {height} x {width} cannot be captured before it was rendered once: the room "
             "for its lists is not known; call it before the capture, with Gaussians as large as there will be"
         )
-    return None if most is None else int(_ROOM * most) + _LEAST_ROOM
+    return None if most is None else min(int(_ROOM * most) + _LEAST_ROOM, _MOST_SLOTS)
 
 
 def remember(inputs: SplatInputs, slots: int) -> None:
@@ -61,13 +63,13 @@ def remember(inputs: SplatInputs, slots: int) -> None:
 
 @contextmanager
 def room_for(inputs: SplatInputs, slots: int) -> Iterator[None]:
-    """Allocate lists of so many slots, which count in 32 bits; a ValueError says why there are so many."""
+    """Allocate what so many slots need; a ValueError says why there are so many."""
     count, (height, width) = inputs.colors.shape[:-1].numel(), inputs.size
     message = (
         f"{count} Gaussians touch {slots} tiles of 16 x 16 pixels at {height} x {width}: more than the device has room "
         "for; they are too wide, or too many, for an image of this size"
     )
-    if slots >= 1 << 31:
+    if slots > _MOST_SLOTS:
         raise ValueError(message)
     try:
         yield
@@ -92,21 +94,23 @@ def report(full: int, not_finite: int, most: int) -> None:
 
 
 def settle(device: torch.device, size: tuple[int, int]) -> bool:
-    """Wait for the device, make room for what did not fit since the last time, and return whether anything failed."""
-    if device not in _notes:
+    """Make room for what did not fit within `without_waiting` since the last time; return whether anything failed."""
+    notes = _notes.get((device, False))
+    if notes is None:
         return False
-    full, not_finite, most = _notes[device].tolist()
-    _notes[device].zero_()
+    full, not_finite, most = notes.tolist()
+    notes.zero_()
     _most[device, 1, size] = max(most, _most.get((device, 1, size), 0))
     return bool(full or not_finite)
 
 
 def notes_of(device: torch.device) -> Tensor:
-    """Return what plans of the device have noted."""
-    if device not in _notes:
+    """Return what plans of the device note, here."""
+    key = device, _waits.get()
+    if key not in _notes:
         with torch.inference_mode(False):
-            _notes[device] = torch.zeros(3, dtype=torch.int64, device=device)
-    return _notes[device]
+            _notes[key] = torch.zeros(3, dtype=torch.int64, device=device)
+    return _notes[key]
 
 
 def _key(inputs: SplatInputs) -> tuple[torch.device, int, tuple[int, int]]:

@@ -12,6 +12,7 @@ import triton.language as tl
 from torch import Tensor
 
 from ..interface import Gradients, SplatInputs
+from .capacity import room_for
 from .plan import PIECE, PIECES, SCALE, SIDE, Plan, fails
 from .program import program
 from .render import channels_at_once, lists_of, render, weigh
@@ -19,7 +20,7 @@ from .render import channels_at_once, lists_of, render, weigh
 # parts of a tile's rows, one for each thread of a pair
 _PARTS = tl.constexpr(4)
 # pixels whose loads are under way at once
-_UNROLL = tl.constexpr(4)
+_UNROLL = tl.constexpr(2)
 # slots that a program adds at once, and columns of terms
 _SLOTS, _COLUMNS = 64, 8
 
@@ -28,7 +29,8 @@ def differentiate(plan: Plan, inputs: SplatInputs, grad: Tensor, geometry: bool)
     """Return the gradients of means, cholesky (None each without `geometry`) and colors."""
     _, cholesky, colors = (t.contiguous() for t in inputs.gaussians)
     channels, total = colors.shape[-1], colors.shape[:-1].numel()
-    terms = torch.empty(plan.room, channels + (5 if geometry else 0), device=colors.device)
+    with room_for(inputs, plan.room):
+        terms = torch.empty(plan.room, channels + (5 if geometry else 0), dtype=torch.float32, device=colors.device)
     leaves = inputs.gaussians if geometry else inputs.gaussians[2:]
     grads = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in leaves]
     means_grad, cholesky_grad = grads[:2] if geometry else (None, None)
@@ -59,7 +61,7 @@ def _gather(  # type: ignore[no-untyped-def]
     BLOCK: tl.constexpr, MAPPED: tl.constexpr, GEOMETRY: tl.constexpr,
 ):  # fmt: skip
     """Sum w g and v (z1, z2, z1 z1, z1 z2, z2 z2) over the pixels of a tile, see whitened.sums_to_gradients."""
-    piece = tl.program_id(0)
+    piece, room = tl.program_id(0), room.to(tl.int64)
     if piece >= tl.load(counters + PIECES):
         return
     tile = tl.load(pieces + piece)
@@ -76,7 +78,7 @@ def _gather(  # type: ignore[no-untyped-def]
     top, left, image = tile // cols % rows * SIDE, tile % cols * SIDE, (tile // (rows * cols)).to(tl.int64)
     first_row = thread // PIECE * (SIDE // _PARTS)
     if MAPPED:
-        plane = tl.load(slots + 2 * room + pair, mask=valid, other=-1)
+        plane = tl.load(slots + 2 * room + pair, mask=valid, other=-1).to(tl.int64)
         membership = weights + plane * (SIDE * SIDE) + first_row * SIDE
     area = height.to(tl.int64) * width
     columns = channels + (5 if GEOMETRY else 0)
@@ -137,7 +139,7 @@ def _reduce(  # type: ignore[no-untyped-def]
     GEOMETRY: tl.constexpr, BLOCK: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
     """Add the terms of a Gaussian in the order of its slots, and turn them into gradients."""
-    g = tl.program_id(0)
+    g, room = tl.program_id(0), room.to(tl.int64)
     moments: tl.constexpr = 5 if GEOMETRY else 0
     columns = channels + moments
     first, last = tl.load(gaussians + g), tl.load(gaussians + total + g)
@@ -151,9 +153,9 @@ def _reduce(  # type: ignore[no-untyped-def]
         for k in range(0, count, BLOCK):
             slot = k + tl.arange(0, BLOCK)
             pair = tl.load(slots + 3 * room + begin + slot, mask=slot < count, other=-1).to(tl.int64)
-            kept = (pair >= 0)[:, None] & (base + column < columns)[None, :]
+            in_terms = (pair >= 0)[:, None] & (base + column < columns)[None, :]
             place = pair[:, None] * columns + base + column[None, :]
-            sums += tl.sum(tl.load(terms + place, mask=kept, other=0.0).to(tl.float64), axis=0)
+            sums += tl.sum(tl.load(terms + place, mask=in_terms, other=0.0).to(tl.float64), axis=0)
         sums = tl.where(failed, float("nan"), sums)
         if GEOMETRY and base == 0:
             s1, s2 = _at(sums, column, 0) / SCALE, _at(sums, column, 1) / SCALE

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 import triton
 import triton.language as tl
@@ -24,6 +25,9 @@ from .program import program
 # Gaussians of a program of `_prepare`, and of a step of the others
 _PREPARE_BLOCK, _BIN_BLOCK, _TILE_BLOCK = 128, 1024, 128
 
+# tiles along a side of an image: their numbers have 16 bits, of which one is the sign
+_MOST_TILES = (1 << 15) - 1
+
 # what programs read as constants
 SIDE = tl.constexpr(TILE)
 PIECE = tl.constexpr(8)  # pairs of a program of the backward
@@ -33,7 +37,9 @@ _REACH = tl.constexpr(1 + RELATIVE_MARGIN)
 _MARGIN = tl.constexpr(MARGIN)
 _Z_LIMIT = tl.constexpr(Z_LIMIT)
 _MEAN_LIMIT = tl.constexpr(MEAN_LIMIT)
-_LEAST_SCALE, _MOST_SCALE = tl.constexpr(SCALE_LIMITS[0] * (1 - 1e-6)), tl.constexpr(SCALE_LIMITS[1])
+# as float32, which `check_values` compares with
+_LEAST_SCALE = tl.constexpr(float(np.float32(SCALE_LIMITS[0] * (1 - 1e-6))))
+_MOST_SCALE = tl.constexpr(SCALE_LIMITS[1])
 
 # places in Plan.counters, int64
 SLOTS = tl.constexpr(0)  # tiles of all boxes
@@ -72,6 +78,8 @@ def plan(inputs: SplatInputs) -> Plan | None:
     count, channels = colors.shape[-2:]
     grid, (height, width), device = grid_of(inputs), inputs.size, means.device
     cell_rows, cell_cols = -(-grid.rows // _CELL.value), -(-grid.cols // _CELL.value)
+    if max(grid.rows, grid.cols) > _MOST_TILES:
+        raise ValueError(f"size must be at most {_MOST_TILES * TILE} on backend 'cuda'; got {inputs.size}")
     num_cells, total = grid.batch * cell_rows * cell_cols, grid.batch * count
     radius, room, foreign, notes = support_radius(inputs.cutoff, means.dtype), reserve(inputs), 0, notes_of(device)
     waits = room is None
@@ -98,7 +106,7 @@ def plan(inputs: SplatInputs) -> Plan | None:
         lists = torch.empty(2, num_cells + grid.total, dtype=torch.int32, device=device)
         with room_for(inputs, room):
             slots = torch.empty(4, room, dtype=torch.int32, device=device)
-            coefficients = torch.empty(room, 5, device=device)
+            coefficients = torch.empty(room, 5, dtype=torch.float32, device=device)
             pieces = torch.empty(2, room // PIECE.value + grid.total, dtype=torch.int32, device=device)
         _bin(
             (num_cells,),
@@ -238,6 +246,7 @@ def _tile(  # type: ignore[no-untyped-def]
     MAPPED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """List the pairs of a tile, cut into pieces."""
+    room = room.to(tl.int64)
     tile = tl.program_id(0)
     column, row, image = tile % cols, tile // cols % rows, tile // (rows * cols)
     cell = (image * cell_rows + row // _CELL) * cell_cols + column // _CELL

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import triton
+from torch import Tensor
 
 
 class Program:
@@ -14,7 +15,6 @@ class Program:
 
     def __init__(self, function: Any, warps: int) -> None:
         names = function.__code__.co_varnames[: function.__code__.co_argcount]
-        self.warps = warps
         # multiply and add in one: Triton 3.9 warns where it is not set, and 3.10 will leave it out
         self.options = {"num_warps": warps, "enable_fp_fusion": True}
         self.constants = [n for n in names if n.isupper()]
@@ -24,7 +24,8 @@ class Program:
 
     def __call__(self, grid: tuple[int, ...], *arguments: Any, **constants: Any) -> None:
         """Run on a grid of programs, on the device of the first argument, which is the present one."""
-        key = (arguments[0].device, *constants.values(), *[a is None for a in arguments])
+        types = [a.dtype if isinstance(a, Tensor) else type(a) for a in arguments]
+        key = (arguments[0].device, *constants.values(), *types)
         compiled = self._compiled.get(key)
         if compiled is None:
             self._compiled[key] = self.jit[grid](*arguments, **constants, **self.options)

@@ -26,7 +26,9 @@ _LEAST_WEIGHT = math.exp(least_exponent(0.0, torch.float32))
 def render(plan: Plan, inputs: SplatInputs, target: Tensor | None = None) -> Tensor:
     """Render (B, C, H, W), without B where the Gaussians have none, minus the target where there is one."""
     grid, channels, (height, width) = plan.grid, inputs.colors.shape[-1], inputs.size
-    image = torch.empty(*inputs.colors.shape[:-2], channels, height, width, device=inputs.colors.device)
+    image = torch.empty(
+        *inputs.colors.shape[:-2], channels, height, width, dtype=torch.float32, device=inputs.colors.device
+    )
     block = channels_at_once(channels)
     with torch.cuda.device_of(image):
         _render(
@@ -63,7 +65,7 @@ def _render(  # type: ignore[no-untyped-def]
     room, num_cells, num_tiles, rows, cols, cutoff, height, width, channels,
     BLOCK: tl.constexpr, MAPPED: tl.constexpr,
 ):  # fmt: skip
-    tile = tl.program_id(0)
+    tile, room = tl.program_id(0), room.to(tl.int64)
     pixel = tl.arange(0, SIDE * SIDE)
     across, down = pixel % SIDE, pixel // SIDE
     x, y = across - (SIDE - 1) / 2, down - (SIDE - 1) / 2
@@ -77,7 +79,9 @@ def _render(  # type: ignore[no-untyped-def]
     for pair in tl.range(first, first + count, loop_unroll_factor=_UNROLL):
         _, _, weight = weigh(tl.load(k), tl.load(k + 1), tl.load(k + 2), tl.load(k + 3), tl.load(k + 4), x, y, cutoff)
         if MAPPED:
-            place = tl.load(slots + 2 * room + pair) * (SIDE * SIDE) + pixel  # below 0 where the region is alone
+            place = (
+                tl.load(slots + 2 * room + pair).to(tl.int64) * (SIDE * SIDE) + pixel
+            )  # below 0 where the region is alone
             weight *= tl.load(weights + place, mask=place >= 0, other=1.0)
         color = colors + tl.load(slots + room + pair).to(tl.int64) * channels + base
         added = ()
