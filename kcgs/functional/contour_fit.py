@@ -173,26 +173,30 @@ def _measure(image: Tensor, labels: Tensor, levels: Sequence[float]) -> tuple[_W
     half, halo = max(_HALF, math.ceil(2 * levels[-1])), math.ceil(RADIUS_SIGMAS * levels[-1])
     side, span = 2 * half + 1, 2 * (half + halo) + 1
     windowed = torch.nn.functional.pad(image, (half,) * 4).unfold(1, side, 1).unfold(2, side, 1)
-    ids = torch.nn.functional.pad(labels, (half + halo,) * 4, value=-1).unfold(0, span, 1).unfold(1, span, 1)
-    kernels = [_blur_matrix(softness, side, halo) for softness in levels]
+    labels = torch.nn.functional.pad(labels.to(image.device), (half + halo,) * 4, value=-1)
+    ids = labels.unfold(0, span, 1).unfold(1, span, 1)
+    kernels = [_blur_matrix(softness, side, halo).to(image) for softness in levels]
     parts = []
     step = max(1, _CHUNK_ELEMENTS // span**2)
     for centers, pair in zip(windows.centers.split(step), windows.pair.split(step), strict=True):
-        rows, cols = centers.unbind(1)
+        rows, cols = centers.to(image.device).unbind(1)
         pixels = windowed[:, rows, cols].flatten(2).permute(1, 2, 0)
-        parts.append(_window_errors(pixels, ids[rows, cols], windows.pairs[pair], kernels))
+        parts.append(_window_errors(pixels, ids[rows, cols], windows.pairs[pair].to(image.device), kernels))
     return windows, _Errors(*map(torch.cat, zip(*parts, strict=True)))
 
 
 def check_problem(image: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
-    """Return an image (C, H, W) and a label map of its size."""
+    """Return an image (C, H, W), and a label map of its size on the CPU.
+
+    Windows are summed where the image is: on a GPU in float64, whose products no setting of torch makes less exact.
+    """
     image = check_floating("image", image, dims=(3,))
     labels = check_labels("labels", labels, dims=(2,))
     if image.shape[0] == 0 or image.shape[1:] != labels.shape:
         raise ValueError(
             f"image must have shape (C, {labels.shape[0]}, {labels.shape[1]}) with labels; got {tuple(image.shape)}"
         )
-    return image.float().cpu(), labels.cpu()
+    return image.double() if image.is_cuda else image.float().cpu(), labels.cpu()
 
 
 def _check_candidates(candidates: Sequence[float]) -> list[float]:
@@ -237,34 +241,37 @@ def _blur_matrix(softness: float, side: int, halo: int) -> Tensor:
 
 
 def _window_errors(pixels: Tensor, ids: Tensor, pairs: Tensor, kernels: list[Tensor]) -> _Errors:
-    """Explain windows of pixels (K, side^2, C), with labels out to the blur's reach (-1: outside the image)."""
+    """Explain windows of pixels (K, side^2, C), with labels out to the blur's reach (-1: outside the image).
+
+    Sums over pixels are taken on their device; what is solved for each window is solved on the CPU.
+    """
     side = kernels[0].shape[0]
     halo = (ids.shape[-1] - side) // 2
     inside = ids[:, None] == pairs[:, :, None, None]  # [K, 2, span, span]
-    y, x = torch.meshgrid(*[torch.linspace(-1, 1, side)] * 2, indexing="ij")
+    y, x = torch.meshgrid(*[torch.linspace(-1, 1, side, dtype=pixels.dtype, device=pixels.device)] * 2, indexing="ij")
     one, taper = torch.ones_like(x), torch.exp(-2 * (x * x + y * y))
     # Pixels of other regions have no weight; what they blur into the pair's pixels is one more unknown colour.
     weight = (taper * inside[..., halo : halo + side, halo : halo + side].any(1)).flatten(1)  # [K, side^2]
     pixels = pixels - (weight[..., None] * pixels).sum(1, keepdim=True) / weight.sum(1)[:, None, None]
     linear = torch.stack([one, x, y]).flatten(1)
     quadratic = torch.stack([one, x, y, x * x, x * y, y * y]).flatten(1).expand(len(ids), -1, -1)
-    down, across = (ids >= 0).any(2).float(), (ids >= 0).any(1).float()  # [K, span]
-    mask, soft = inside.float(), []
+    down, across = (ids >= 0).any(2).to(pixels), (ids >= 0).any(1).to(pixels)  # [K, span]
+    energy = (weight[..., None] * pixels.square()).sum((1, 2)).cpu().double()
+    mask, soft = inside.to(pixels), []
     for kernel in kernels:
         total = (down @ kernel.T)[:, :, None] * (across @ kernel.T)[:, None, :]
         membership = (kernel @ mask @ kernel.T / total[:, None].clamp_min(1e-30)).flatten(2)  # [K, 2, side^2]
         features = (membership[:, :, None] * linear).flatten(1, 2)
         others = 1 - membership.sum(1, keepdim=True)
-        soft.append(_least_error(torch.cat([features, others], 1), pixels, weight))
-    smooth = _least_error(quadratic, pixels, weight)
-    return _Errors(torch.stack(soft, 1), smooth, weight.sum(1).double() * pixels.shape[2])
+        soft.append(energy - _explained_energy(torch.cat([features, others], 1), pixels, weight))
+    smooth = energy - _explained_energy(quadratic, pixels, weight)
+    return _Errors(torch.stack(soft, 1), smooth, weight.sum(1).cpu().double() * pixels.shape[2])
 
 
-def _least_error(features: Tensor, pixels: Tensor, weight: Tensor) -> Tensor:
-    """Return the squared error of the best mix of features (K, F, side^2), with a ridge on its coefficients."""
+def _explained_energy(features: Tensor, pixels: Tensor, weight: Tensor) -> Tensor:
+    """Return the energy of the best mix of features (K, F, side^2), with a ridge on its coefficients."""
     weighted = features * weight[:, None]
-    gram, moment = (weighted @ features.mT).double(), (weighted @ pixels).double()
+    gram, moment = (weighted @ features.mT).cpu().double(), (weighted @ pixels).cpu().double()
     gram.diagonal(dim1=-2, dim2=-1).add_(_RIDGE * weight.shape[1] / (2 * _HALF + 1) ** 2)
     explained: Tensor = torch.linalg.solve_triangular(torch.linalg.cholesky(gram), moment, upper=False)
-    energy = (weight[..., None] * pixels.square()).sum((1, 2)).double()
-    return energy - explained.square().sum((1, 2))
+    return explained.square().sum((1, 2))

@@ -70,6 +70,13 @@ class TestChooseSoftness:
         chart = choose_softness(*chart_2x3())
         assert len(chart) == 7 and set(chart.values()) == {0.0}
 
+    def test_a_gpu_chooses_the_same(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """It sums windows in float64."""
+        image, labels = paint(ellipse(), 1.0) + grain(0.02), ellipse()
+        expected = choose_softness(image, labels)
+        monkeypatch.setattr(contour_fit, "check_problem", lambda image, labels: (image.double(), labels))
+        assert choose_softness(image, labels) == expected
+
     def test_pairs(self) -> None:
         """0 | 1 is hard, 1 | 2 soft."""
         labels = torch.arange(90).div(30, rounding_mode="floor").repeat(40, 1)
