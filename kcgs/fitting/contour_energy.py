@@ -26,8 +26,8 @@ _BATCH_PIXELS = 1 << 20
 
 
 def index_map(regions: RegionMap, labels: Tensor) -> Labels:
-    """Return the position of each label among the map's ids, (H, W); -1 for a label that the map lacks."""
-    return np.asarray(regions.index_of(labels).cpu().numpy(), dtype=np.int32)
+    """Return the position of each label among the ids of a map on the CPU, (H, W); -1 for a label that it lacks."""
+    return np.asarray(regions.index_of(labels).numpy(), dtype=np.int32)
 
 
 def bounding_boxes(index: Labels, count: int, margin: int) -> Ints:

@@ -32,19 +32,18 @@ def refine_contours(
     """Move contours to where the image is explained better, at most `max_distance` from the map `anchor`.
 
     Exact coordinate descent on the energy in docs/method.md; no region is lost. Pieces under `smallest` pixels that
-    moves have made are merged into the adjacent label that costs least. Where no move lowers the energy, the result is
-    the scene's map itself.
+    moves have made are merged into the adjacent label that costs least. The map is on the CPU. Where no move lowers the
+    energy, the result is the scene's map itself.
 
     Source: Mumford and Shah's functional of 1989; Besag's iterated conditional modes of 1986.
     """
     from .contour_energy import MovingLabels, bounding_boxes, index_map, region_costs  # loads numba
 
-    regions = scene.regions
-    assert regions is not None
-    anchor = regions.labels if anchor is None else anchor
+    assert scene.regions is not None
+    regions = scene.regions.to("cpu")
     if regions.num_regions == 1:
-        return regions
-    index = index_map(regions, regions.labels)
+        return scene.regions
+    index = regions.index[0].numpy()
     distance = min(1 if max_distance is None else max_distance, math.hypot(*index.shape))
     pad = 2 * math.ceil(max(reach, distance, 2) / 2)  # even: with the rim, rows and columns keep their parity
     rim = edge_band(torch.from_numpy(index), 1).numpy()
@@ -53,16 +52,15 @@ def refine_contours(
     moving = MovingLabels(index, costs, length_weight, pad, smallest)
     moving.fix_cores(rim, reach * sweeps)
     if max_distance is not None:
-        moving.limit_moves(index_map(regions, anchor), distance)
+        moving.limit_moves(index if anchor is None else index_map(regions, anchor.cpu()), distance)
     for _ in range(sweeps):
         if not moving.sweep(reach):
             break
     while moving.merge_pieces():
         pass
     if not moving.energy_change() < 0:
-        return regions
-    labels = regions.ids.cpu()[torch.from_numpy(moving.map).long()].to(regions.labels.device)
-    return regions.relabel(labels, "mean")
+        return scene.regions
+    return regions.relabel(regions.ids[torch.from_numpy(moving.map).long()], "mean")
 
 
 def move_contours(
@@ -91,26 +89,31 @@ def move_contours(
     )  # fmt: skip
     if proposal is regions:
         return regions
-    return accept_moves(regions, proposal, max_rise * squared_error(regions) - squared_error(proposal))
+    device = regions.ids.device
+    before, after = regions.to("cpu"), proposal.to(device)
+    accepted = accept_moves(before, proposal, (max_rise * squared_error(regions) - squared_error(after)).cpu())
+    if accepted is before:
+        return regions
+    return after if accepted is proposal else accepted.to(device)
 
 
 def accept_moves(before: RegionMap, after: RegionMap, gain: Tensor) -> RegionMap:
-    """Accept, of the moves between two maps, those whose surroundings are rendered better; lose no region.
+    """Accept, of the moves between two maps on the CPU, those whose surroundings are rendered better; lose no region.
 
     Moves are judged by the region's Gaussians alone; the render blends them over soft contours. Pixels that changed are
     grouped with all within two pixels, and a group stays changed where its gain, (H, W), is positive in its sum.
     """
     from scipy import ndimage
 
-    changed, accepted = (before.labels != after.labels).cpu().numpy(), np.zeros(before.size, np.bool_)
+    changed, accepted = (before.labels != after.labels).numpy(), np.zeros(before.size, np.bool_)
     box = tuple(slice(max(0, places.min() - 3), places.max() + 4) for places in np.nonzero(changed))
     groups, count = ndimage.label(ndimage.binary_dilation(changed[box], iterations=2), np.ones((3, 3)))
-    sums = ndimage.sum_labels(gain.double().cpu().numpy()[box], groups, np.arange(1, count + 1))
+    sums = ndimage.sum_labels(gain.double().numpy()[box], groups, np.arange(1, count + 1))
     accepted[box] = np.concatenate([[False], sums > 0])[groups]
     if not (accepted & changed).any():
         return before
     if accepted[changed].all():
         return after
-    labels = torch.where(torch.from_numpy(accepted).to(before.labels.device), after.labels, before.labels)
+    labels = torch.where(torch.from_numpy(accepted), after.labels, before.labels)
     regions = after.relabel(labels, "mean")
     return before if regions.num_regions < before.num_regions else regions

@@ -59,4 +59,5 @@ def _regions_to_render(image: Tensor, regions: RegionMap | None, config: FitConf
         return regions
     if config.softness != "auto":
         return RegionMap.from_labels(regions.labels, config.softness)
-    return RegionMap.from_labels(regions.labels, choose_softness(image, regions.labels))
+    labels = regions.labels.cpu()
+    return RegionMap.from_labels(labels, choose_softness(image, labels)).to(image.device)

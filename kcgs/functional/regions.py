@@ -178,6 +178,8 @@ class RegionMap:
         """
         if labels.shape != self._labels.shape:
             raise ValueError(f"labels must have shape {tuple(self._labels.shape)}; got {tuple(labels.shape)}")
+        if not self._labels.is_cpu:  # a device would be waited for at every step
+            return self.to("cpu").relabel(labels.cpu(), new_contours).to(self._labels.device)
         softness: float | Mapping[tuple[int, int], float] = self.softness
         if isinstance(softness, PairSoftness) and new_contours == "mean":
             mean = sum(softness.values()) / len(softness)

@@ -35,8 +35,9 @@ class AdaptContours:
         regions, problem = state.scene.regions, state.problem
         is_turn = state.num_additions % self.additions_per_softness == self.additions_per_move
         if regions is not None and problem.chooses_softness and is_turn:
-            softness = choose_softness(problem.image, regions.labels)
-            state.scene.regions = RegionMap.from_labels(regions.labels, softness)
+            labels = regions.labels.cpu()
+            chosen = RegionMap.from_labels(labels, choose_softness(problem.image, labels))
+            state.scene.regions = chosen.to(problem.image.device)
 
 
 def _move_contours(state: FitState, max_rise: float) -> None:
