@@ -13,7 +13,7 @@ from kcgs.functional import RegionMap, region_splat
 from kcgs.functional.blur import blur, gaussian_taps
 from kcgs.scene import Scene
 
-from .contour_loops import CostTable, energy_change, list_small_pieces, piece_energy, sweep
+from .contour_loops import NOT_COUNTED, CostTable, SweepState, energy_change, list_small_pieces, piece_energy, sweep
 
 Ints = NDArray[np.int64]
 Labels = NDArray[np.int32]
@@ -107,19 +107,24 @@ class MovingLabels:
         self._sides = disc(1, self._stride)[1:]
         # two neighbours that differ count an eighth each
         self._energy_of = self._labels, costs, length_weight / 4, disc(2, self._stride)
-        self._floor = np.minimum(np.bincount(index.ravel()), smallest)
+        self._areas = np.bincount(index.ravel())
+        self._floor = np.minimum(self._areas, smallest)
         self._free = self._labels >= 0
         self._specks = np.zeros(padded.size, np.bool_)  # pixels of pieces that were small before any move
-        self._specks[list_small_pieces(self._labels, self._stride, smallest)[0]] = True
+        self._specks[self._list_small_pieces()[0]] = True
         self._limit = np.zeros(0, np.int32), np.zeros(0, np.int64)  # a pixel may take any label
+        counts = np.full(padded.size, NOT_COUNTED, np.int8)
+        self._sweeps = SweepState(np.ones(padded.size, np.uint8), counts)
 
     def fix_cores(self, rim: Mask, distance: int) -> None:
         """Fix the pixels that each region keeps, unless it has that many beyond the distance that contours move."""
-        from scipy.ndimage import distance_transform_cdt
-
-        depth = distance_transform_cdt(~rim, "chessboard").clip(max=distance + 1)
-        deep = np.bincount(self.map[depth > distance], minlength=len(self._floor))
-        y, x = np.nonzero((deep < self._floor)[self.map])
+        depth, is_near = np.zeros(rim.shape, np.int16), rim
+        for _ in range(distance + 1):  # in squares around the rim: a distance transform takes ten times as long
+            depth += ~is_near
+            is_near = _grow(is_near)
+        deep = self._areas - np.bincount(self.map[depth <= distance], minlength=len(self._areas))
+        pixels = np.flatnonzero(np.take(deep < self._floor, self.map))
+        y, x = np.divmod(pixels, rim.shape[1])
         region = self.map[y, x]
         order = np.lexsort((-depth[y, x], region))
         rank = np.arange(len(order)) - np.searchsorted(region[order], region[order])
@@ -132,15 +137,25 @@ class MovingLabels:
         self._limit = np.pad(anchor, self._pad, mode="edge").reshape(-1), disc(distance, self._stride)
 
     def sweep(self, reach: int) -> bool:
-        """Give every free pixel near a contour its best label; True if one changed."""
-        return bool(sweep(*self._energy_of, self._limit, self._free, disc(reach, self._stride)))
+        """Give every free pixel near a contour its best label, before pieces are merged; True if one changed."""
+        neighborhood = disc(reach, self._stride)
+        return bool(sweep(*self._energy_of, self._limit, self._free, self._list_edges(), neighborhood, self._sweeps))
+
+    def _list_edges(self) -> Ints:
+        """List the pixels that differ from the one right of them or below, in order."""
+        here, stride = self._labels[: -self._stride], self._stride
+        return np.flatnonzero((here != self._labels[1 : 1 - stride]) | (here != self._labels[stride:]))
+
+    def _list_small_pieces(self) -> tuple[Ints, Ints]:
+        pixels, first = list_small_pieces(self._labels, self._list_edges(), self._stride, self._smallest)
+        return pixels, first
 
     def merge_pieces(self) -> bool:
         """Merge small pieces that moves have made into their neighbours, the smallest first; True if one was merged.
 
         Each call that returns True leaves fewer pieces, so that repetition ends.
         """
-        pixels, pieces = list_small_pieces(self._labels, self._stride, self._smallest)
+        pixels, pieces = self._list_small_pieces()
         order = np.lexsort((pixels, pieces))
         pixels, pieces = pixels[order], pieces[order]
         areas = np.bincount(self.map.ravel(), minlength=len(self._floor))
@@ -169,6 +184,16 @@ class MovingLabels:
     def energy_change(self) -> float:
         """Return the energy of the map, less that before all moves."""
         return float(energy_change(self._before, *self._energy_of))
+
+
+def _grow(mask: Mask) -> Mask:
+    """Add the eight pixels around each one of a mask."""
+    for axis in (0, 1):
+        lines, grown = np.moveaxis(mask, axis, 0), np.moveaxis(mask.copy(), axis, 0)
+        grown[1:] |= lines[:-1]
+        grown[:-1] |= lines[1:]
+        mask = np.moveaxis(grown, 0, axis)
+    return mask
 
 
 def disc(radius: float, stride: int) -> Ints:

@@ -18,6 +18,15 @@ _SMALL = 2
 _LARGE = 3
 # cost of a unit of curvature, in costs of two neighbours that differ
 _CURVATURE_COST = 1.2
+# in place of the excess of a pixel whose neighbours were not counted
+NOT_COUNTED = -128
+
+
+class SweepState(NamedTuple):
+    """What sweeps of one map leave to each other, for each pixel of the flat map."""
+
+    pending: Any  # uint8, in how many sweeps from the present one on it may change, unless pixels nearby do
+    excess: Any  # int8, how many more pixels around it differ from it than equal it, or NOT_COUNTED
 
 
 class CostTable(NamedTuple):
@@ -55,36 +64,42 @@ def _allows(limit, pixel, label):  # type: ignore[no-untyped-def]
 
 
 @program.entry
-def sweep(labels, costs, pair_cost, disc, limit, free, neighborhood):  # type: ignore[no-untyped-def]
+def sweep(labels, costs, pair_cost, disc, limit, free, edges, neighborhood, state):  # type: ignore[no-untyped-def]
     """Give every free pixel the best label of its neighborhood; True if one changed.
 
-    The map is flat and has a rim of -1. Neighborhoods are those before the sweep.
+    The map is flat and has a rim of -1; `edges` are the pixels that differ from the one right of them or below.
+    Neighborhoods are those before the sweep. A pixel near which none has changed since its last visit would stay.
     """
     before, changed = labels.copy(), False
-    pixels = _list_near_contours(labels, free, costs.stride, neighborhood)
+    pixels, parities = _list_near_contours(labels, free, edges, costs.stride, neighborhood)
     for parity in range(4):  # neighbours differ in parity: pixels of one parity change at the same time
-        for pixel in pixels:
-            if pixel // costs.stride % 2 * 2 + pixel % costs.stride % 2 != parity:
+        for k in range(len(pixels)):
+            pixel = pixels[k]
+            if parities[k] != parity or state.pending[pixel] == 0:
                 continue
             present = before[pixel]
-            best, least = present, _curved_energy(labels, costs, pair_cost, disc, pixel, present)
-            for k in range(1, len(neighborhood)):
-                label = before[pixel + neighborhood[k]]
-                if label == present or label == -1 or _has(before, pixel, neighborhood[:k], label):
+            best, least = present, _curved_energy(labels, state, costs, pair_cost, disc, pixel, present)
+            for place in range(1, len(neighborhood)):
+                label = before[pixel + neighborhood[place]]
+                if label == present or label == -1 or _has(before, pixel, neighborhood[:place], label):
                     continue
-                energy = _curved_energy(labels, costs, pair_cost, disc, pixel, label)
+                energy = _curved_energy(labels, state, costs, pair_cost, disc, pixel, label)
                 if energy < least and _allows(limit, pixel, label):
                     best, least = label, energy
-            labels[pixel] = best
-            changed |= best != present
+            if best != present:
+                changed = True
+                _change(labels, state, disc, neighborhood, pixel, best)
+    for pixel in range(len(labels)):
+        state.pending[pixel] -= state.pending[pixel] > 0
     return changed
 
 
 @inner
-def _list_near_contours(labels, free, stride, neighborhood):  # type: ignore[no-untyped-def]
-    """List the free pixels whose neighborhood holds the two sides of a contour, and a few more."""
-    pixels, is_listed, count = np.empty(len(labels), np.int64), np.zeros(len(labels), np.bool_), 0
-    for pixel in range(len(labels) - stride):
+def _list_near_contours(labels, free, edges, stride, neighborhood):  # type: ignore[no-untyped-def]
+    """List the free pixels whose neighborhood holds the two sides of a contour, and a few more; with their parities."""
+    pixels, parities = np.empty(len(labels), np.int64), np.empty(len(labels), np.uint8)
+    is_listed, count = np.zeros(len(labels), np.bool_), 0
+    for pixel in edges:
         for other in (pixel + 1, pixel + stride):
             if labels[pixel] == labels[other] or labels[pixel] == -1 or labels[other] == -1:
                 continue
@@ -93,8 +108,26 @@ def _list_near_contours(labels, free, stride, neighborhood):  # type: ignore[no-
                     near = end + offset
                     if free[near] and not is_listed[near]:
                         pixels[count], is_listed[near] = near, True
+                        parities[count] = near // stride % 2 * 2 + near % stride % 2
                         count += 1
-    return pixels[:count]
+    return pixels[:count], parities[:count]
+
+
+@inner
+def _change(labels, state, disc, neighborhood, pixel, label):  # type: ignore[no-untyped-def]
+    """Give a pixel a label, and keep the state of the sweeps."""
+    present, labels[pixel], state.excess[pixel] = labels[pixel], label, NOT_COUNTED
+    for offset in neighborhood:
+        state.pending[pixel + offset] = 2
+    for offset in disc:
+        center = pixel + offset
+        around = labels[center]
+        if around == -1:
+            continue
+        if state.excess[center] != NOT_COUNTED:
+            state.excess[center] += 2 * int(around == present) - 2 * int(around == label)
+        for further in disc:
+            state.pending[center + further] = 2
 
 
 @inner
@@ -107,26 +140,36 @@ def _energy(labels, costs, pair_cost, disc, pixel, label):  # type: ignore[no-un
 
 
 @inner
-def _curved_energy(labels, costs, pair_cost, disc, pixel, label):  # type: ignore[no-untyped-def]
+def _curved_energy(labels, state, costs, pair_cost, disc, pixel, label):  # type: ignore[no-untyped-def]
     """Return the part of the energy that depends on a pixel's label, up to a constant."""
-    present, curvature = labels[pixel], 0
-    labels[pixel] = label
-    for offset in disc:
-        curvature += _curvature(labels, disc, pixel + offset)
-    labels[pixel] = present
+    present, excess, curvature = labels[pixel], 0, 0
+    for offset in disc[1:]:
+        center = pixel + offset
+        around = labels[center]
+        if around == -1:
+            continue
+        excess += 1 - 2 * int(around == label)
+        if state.excess[center] == NOT_COUNTED:
+            state.excess[center] = _count_excess(labels, disc, center)
+        curvature += max(state.excess[center] + 2 * int(around == present) - 2 * int(around == label), 0) ** 2
+    curvature += max(excess, 0) ** 2
     return _energy(labels, costs, pair_cost, disc, pixel, label) + _CURVATURE_COST * pair_cost * curvature
 
 
 @inner
 def _curvature(labels, disc, pixel):  # type: ignore[no-untyped-def]
     """Return the square of how many more pixels around one differ from it than equal it; 0 if no more do."""
+    return 0 if labels[pixel] == -1 else max(_count_excess(labels, disc, pixel), 0) ** 2
+
+
+@inner
+def _count_excess(labels, disc, pixel):  # type: ignore[no-untyped-def]
+    """Return how many more pixels around one differ from it than equal it."""
     excess, center = 0, labels[pixel]
-    if center == -1:
-        return 0
     for offset in disc[1:]:
         label = labels[pixel + offset]
         excess += int(-1 != label != center) - int(label == center)
-    return max(excess, 0) ** 2
+    return excess
 
 
 @program.entry
@@ -161,15 +204,15 @@ def energy_change(before, after, costs, pair_cost, disc):  # type: ignore[no-unt
 
 
 @program.entry
-def list_small_pieces(labels, stride, smallest):  # type: ignore[no-untyped-def]
+def list_small_pieces(labels, edges, stride, smallest):  # type: ignore[no-untyped-def]
     """Return the pixels of 4-connected pieces under `smallest` pixels, and the first pixel of each one's piece.
 
-    The map is flat and has a rim of -1. Every piece has a pixel beside another label: from there it is filled, until it
-    is too large.
+    The map is flat and has a rim of -1; `edges` are as for `sweep`. Every piece has a pixel beside another label: from
+    there it is filled, until it is too large.
     """
     state, queue = np.zeros(len(labels), np.uint8), np.empty(smallest, np.int64)
     pixels, first, end = np.empty(64, np.int64), np.empty(64, np.int64), 0
-    for pixel in range(len(labels) - stride):
+    for pixel in edges:
         for other in (pixel + 1, pixel + stride):
             if labels[other] == labels[pixel]:
                 continue
