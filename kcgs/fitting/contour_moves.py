@@ -106,7 +106,8 @@ def accept_moves(before: RegionMap, after: RegionMap, gain: Tensor) -> RegionMap
     from scipy import ndimage
 
     changed, accepted = (before.labels != after.labels).numpy(), np.zeros(before.size, np.bool_)
-    box = tuple(slice(max(0, places.min() - 3), places.max() + 4) for places in np.nonzero(changed))
+    places = np.divmod(np.flatnonzero(changed), before.size[1])
+    box = tuple(slice(max(0, place.min() - 3), place.max() + 4) for place in places)
     groups, count = ndimage.label(ndimage.binary_dilation(changed[box], iterations=2), np.ones((3, 3)))
     sums = ndimage.sum_labels(gain.double().numpy()[box], groups, np.arange(1, count + 1))
     accepted[box] = np.concatenate([[False], sums > 0])[groups]

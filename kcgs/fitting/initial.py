@@ -73,15 +73,14 @@ def random_field(image: Tensor, num_gaussians: int, regions: RegionMap | None, s
     """Scatter round Gaussians uniformly over the image, in random colours."""
     size = (image.shape[1], image.shape[2])
     sigma = initial_sigma(size, num_gaussians)
-    field = GaussianField.random(
-        num_gaussians, size, channels=len(image), sigma=sigma, seed=seed, dtype=image.dtype
-    ).to(image.device)
-    if regions is None:
-        return field
-    field.assign_regions(regions)
-    with torch.no_grad():
-        _fill_empty_regions(field, regions, seed)
-    return field.assign_regions(regions)
+    field = GaussianField.random(num_gaussians, size, channels=len(image), sigma=sigma, seed=seed, dtype=image.dtype)
+    if regions is not None:
+        regions = regions.to("cpu")  # a device would be waited for in each empty region
+        field.assign_regions(regions)
+        with torch.no_grad():
+            _fill_empty_regions(field, regions, seed)
+        field.assign_regions(regions)
+    return field.to(image.device)
 
 
 def _fill_empty_regions(field: GaussianField, regions: RegionMap, seed: int) -> None:
