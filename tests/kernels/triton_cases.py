@@ -380,16 +380,31 @@ def test_graph_is_nan_where_lists_do_not_fit(monkeypatch: pytest.MonkeyPatch) ->
 @needs_gpu
 @pytest.mark.filterwarnings("ignore:The CUDA Graph is empty")  # torch's own, at its first graph
 def test_compiled_step() -> None:
-    field, target = GaussianField.random(100, (48, 64), seed=0).to(DEVICE), torch.rand(1, 3, 48, 64, device=DEVICE)
-    renderer = RegionSplatRenderer()
+    regions = RegionMap.from_labels((torch.arange(64, device=DEVICE) // 25).expand(48, 64), 0.7)
+    field = GaussianField.random(100, (48, 64), regions=regions, seed=0).to(DEVICE)
+    target, renderer = torch.rand(1, 3, 48, 64, device=DEVICE), RegionSplatRenderer()
 
     def loss() -> Tensor:
-        return (renderer(field) - target).square().mean()
+        return (renderer(field, regions) - target).square().mean()
 
+    expected = torch.autograd.grad(loss(), [*field.parameters()])
     compiled = torch.compile(loss, mode="reduce-overhead")
     for _ in range(4):
         torch.compiler.cudagraph_mark_step_begin()
-        gradients = torch.autograd.grad(compiled(), [*field.parameters()])
-        gradients = [g.clone() for g in gradients]
-    for a, b in zip(gradients, torch.autograd.grad(loss(), [*field.parameters()]), strict=True):
+        gradients = [g.clone() for g in torch.autograd.grad(compiled(), [*field.parameters()])]
+    for a, b in zip(gradients, expected, strict=True):
         assert (a - b).abs().max() <= 1e-5 * b.abs().max()
+
+
+@needs_gpu
+def test_backward_waits_for_nothing() -> None:
+    """Nor does a captured or a fit's forward, which `test_without_waiting` has."""
+    arguments = small_splat()
+    leaves = [arguments[name].requires_grad_() for name in ("means", "cholesky", "colors")]
+    image = region_splat(**arguments)
+    grad = torch.ones_like(image)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        torch.autograd.grad(image, leaves, grad)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
