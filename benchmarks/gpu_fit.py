@@ -146,9 +146,10 @@ def jobs(options: Options) -> list[Job]:
     elif options.data is not None:
         frames = choose(options, "davis")
         plan += [(image, n, GPU) for image in frames for n in DAVIS_COUNTS]
-        plan += [(KODAK_COMPARED[0], KODAK_COUNT, method) for method in FIRST.values()]
-        plan += [(image, KODAK_COUNT, method) for image in KODAK_COMPARED for method in (CORES, OTHER)]
+        plan += [(KODAK_COMPARED[0], KODAK_COUNT, FIRST["process"])]
         plan += [(image, n, CORES) for image in DAVIS_COMPARED for n in DAVIS_COUNTS]
+        plan += [(image, KODAK_COUNT, method) for method in (CORES, OTHER) for image in KODAK_COMPARED]
+        plan += [(KODAK_COMPARED[0], KODAK_COUNT, FIRST["machine"])]
     return [
         {"image": image, "n": n, "method": method, "device": METHODS[method][2], **options.image_arguments()}
         for image, n, method in plan
