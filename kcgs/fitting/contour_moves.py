@@ -109,7 +109,7 @@ def accept_moves(before: RegionMap, after: RegionMap, gain: Tensor) -> RegionMap
     places = np.divmod(np.flatnonzero(changed), before.size[1])
     box = tuple(slice(max(0, place.min() - 3), place.max() + 4) for place in places)
     groups, count = ndimage.label(ndimage.binary_dilation(changed[box], iterations=2), np.ones((3, 3)))
-    sums = ndimage.sum_labels(gain.double().numpy()[box], groups, np.arange(1, count + 1))
+    sums = ndimage.sum_labels(gain.numpy()[box].astype(np.float64), groups, np.arange(1, count + 1))
     accepted[box] = np.concatenate([[False], sums > 0])[groups]
     if not (accepted & changed).any():
         return before

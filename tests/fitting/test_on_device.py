@@ -18,9 +18,12 @@ from kcgs import FitConfig, fit
 from kcgs.fitting import FitResult, descent
 from kcgs.fitting.readback import Readback
 from kcgs.fitting.state import FitState
-from kcgs.fitting.strategies import Densify, EndDrafts
+from kcgs.fitting.strategies import Densify, EndDrafts, contours
+from kcgs.functional import PairSoftness, contour_fit
 from kcgs.kernels.cuda.capacity import reports
 from kcgs.optim import gaussian_adam
+
+from .absent_device import AbsentDevice, DeviceTensor
 
 log = importlib.import_module("kcgs.fitting.log")
 loop = importlib.import_module("kcgs.fitting.loop")
@@ -199,6 +202,31 @@ def test_a_step_reads_no_value_and_takes_few_operations(ahead: pytest.MonkeyPatc
     counts = [len(operations) for iteration, operations, _ in steps if iteration not in checked]
     assert len(counts) > 150 and min(counts) == 2 and max(counts) <= 6
     assert max(len(operations) for _, operations, _ in steps[1:]) <= 25
+
+
+def test_contours_move_on_a_device_with_few_waits_and_sums_of_one_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No operation mixes devices, either."""
+    device, move, counts, maps = AbsentDevice(), contours.move_contours, [], set()
+
+    def move_contours(*arguments: Any) -> Any:
+        before = device.num_operations, device.num_waits
+        regions = move(*arguments)
+        counts.append((device.num_operations - before[0], device.num_waits - before[1]))
+        maps.add(regions)
+        return regions
+
+    monkeypatch.setattr(contours, "move_contours", move_contours)
+    # the windows of widths are summed on a GPU
+    monkeypatch.setattr(contour_fit, "check_problem", lambda image, labels: (image.double(), labels.cpu()))
+    labels = (torch.arange(40) > 17).long().expand(32, 40).clone()
+    labels[20:, 25:] = 5
+    painted = (image() + 0.3 * (labels == 1) - 0.2 * (labels == 5)).clamp(0.0, 1.0)
+    with device.use():
+        result = fit(DeviceTensor(painted), labels, 60, recipe=FitConfig(iterations=60))
+    assert isinstance(result.scene.regions.softness, PairSoftness)
+    assert len(counts) > 5 and len(maps) > 2
+    assert max(operations for operations, _ in counts) < 150 and max(waits for _, waits in counts) < 20
+    assert not device.unordered
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="it takes a GPU")
