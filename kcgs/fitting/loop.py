@@ -53,12 +53,11 @@ def fit(
 ) -> FitResult:
     r"""Fit Gaussians to an image.
 
-    Convention: on a CPU, the same arguments and number of threads give the same scene, bit for bit (unless the clock
-    stops it). On a GPU, fits that move contours differ by up to 0.1 dB, and the history comes up to 20 iterations late.
-    The best state that was logged is returned, not the last. The first 85 % of a fit render drafts with a larger
-    cutoff, and are not compared with the rest. The scene holds fewer than N Gaussians where the recipe prunes, or its
-    target takes fewer. With `target_psnr` several fits search for the fewest Gaussians that reach it; `on_step` counts
-    the iterations of each.
+    Convention: on one device, the same arguments and number of threads give the same scene, bit for bit (unless the
+    clock stops it). On a GPU the history comes up to 20 iterations late. The best state that was logged is returned,
+    not the last. The first 85 % of a fit render drafts with a larger cutoff, and are not compared with the rest. The
+    scene holds fewer than N Gaussians where the recipe prunes, or its target takes fewer. With `target_psnr` several
+    fits search for the fewest Gaussians that reach it; `on_step` counts the iterations of each.
 
     Args:
         image: Tensor :math:`(C, H, W)` or :math:`(1, C, H, W)`, floating, values in [0, 1]; a numpy array
