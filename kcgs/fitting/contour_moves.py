@@ -105,7 +105,8 @@ def accept_moves(before: RegionMap, after: RegionMap, gain: Tensor) -> RegionMap
     """
     from scipy import ndimage
 
-    changed, accepted = (before.labels != after.labels).numpy(), np.zeros(before.size, np.bool_)
+    old, new = before.labels, after.labels
+    changed, accepted = (old != new).numpy(), np.zeros(before.size, np.bool_)
     places = np.divmod(np.flatnonzero(changed), before.size[1])
     box = tuple(slice(max(0, place.min() - 3), place.max() + 4) for place in places)
     groups, count = ndimage.label(ndimage.binary_dilation(changed[box], iterations=2), np.ones((3, 3)))
@@ -115,6 +116,5 @@ def accept_moves(before: RegionMap, after: RegionMap, gain: Tensor) -> RegionMap
         return before
     if accepted[changed].all():
         return after
-    labels = torch.where(torch.from_numpy(accepted), after.labels, before.labels)
-    regions = after.relabel(labels, "mean")
+    regions = after.relabel(torch.where(torch.from_numpy(accepted), new, old), "mean")
     return before if regions.num_regions < before.num_regions else regions
