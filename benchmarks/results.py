@@ -57,7 +57,7 @@ def page() -> str:
         match = re.match(r"# (?P<question>.*)\n\n(.*\n\n)??(?P<answer>.+)\n\n!\[\]\((?P<figure>.*)\)", text)
         assert match is not None, name
         question, answer, figure = match["question"], match["answer"], match["figure"]
-        note = "" if run.get("tree") == tree else "Measured with an earlier tree. "
+        note = "" if run.get("tree") == tree else "Measured with another tree. "
         note += f"{run['note']} " if run["note"] else ""
         link, image = f"[Report]({LINK}/{name}/report.md)", f"![{question}]({LINK}/{name}/{figure})"
         sections.append(f"## {question}\n\n{answer} {note}{link}\n\n{image}\n")
