@@ -12,8 +12,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
 from kcgs.functional import RegionMap, lookup_regions, region_splat
-from kcgs.functional.blur import gaussian_taps
-from kcgs.kernels import takes_triton, threads_for_torch
+from kcgs.kernels import takes_triton
 from kcgs.nn import GaussianField
 
 # Standard deviations that are tried, in pixels, by the side of the blocks that the residual is averaged over for them.
@@ -53,8 +52,7 @@ def propose(residual: Tensor, regions: RegionMap | None, count: int, *, backend:
     missing = count
     with torch.no_grad():
         while missing > 0:
-            with threads_for_torch():
-                gain, means, sigma, colors = _local_maxima(residual, regions, floor)
+            gain, means, sigma, colors = _local_maxima(residual, regions, floor)
             if not len(gain):
                 break
             strongest = gain.sort(descending=True, stable=True)[1][:missing]
@@ -63,12 +61,12 @@ def propose(residual: Tensor, regions: RegionMap | None, count: int, *, backend:
             ids = None if regions is None else lookup_regions(means, regions.labels)
             rendered = region_splat(means, cholesky, colors, ids, regions, size=size, cutoff=_CUTOFF, backend=backend)
             # Gaussians overlap: a step of the best length makes the fall of the error certain
-            length = (rendered * residual).sum() / rendered.square().sum()
+            length = rendered.flatten().dot(residual.flatten()) / rendered.flatten().dot(rendered.flatten())
             if not bool(length > 0):
                 break
             parts.append([means, cholesky, colors * length])
             region_ids += [] if ids is None else [ids]
-            residual, missing = residual - rendered * length, missing - len(means)
+            residual, missing = torch.addcmul(residual, rendered, length, value=-1.0), missing - len(means)
     means, cholesky, colors = (torch.cat(rows) for rows in zip(*parts, strict=True))
     return GaussianField(means, cholesky, colors, torch.cat(region_ids) if region_ids else None, size=size)
 
@@ -79,13 +77,15 @@ def _local_maxima(residual: Tensor, regions: RegionMap | None, floor: float) -> 
     best, factors, block = torch.zeros_like(residual[0]), _scatter(residual[0]), 1
     scales, parts = [], []
     for scale in _scales(residual, labels):
-        middles, gain = _middles(best, scale.block), scale.gain * _middles(factors, scale.block)
-        # in a region of one pixel all sizes are the same: only the first counts
-        scales.append(scale._replace(gain=torch.where(gain > middles, gain, 0.0)))
-        torch.maximum(middles, gain, out=middles)
+        middles = _middles(best, scale.block)
+        scale.gain.mul_(_middles(factors, scale.block))
+        torch.maximum(middles, scale.gain, out=middles)
+        scales.append(scale)
+        # in a region of one pixel all sizes are the same: the first counts
+        factors.mul_(1.0 - _SCATTER)
     for sigma, side, gain, colors in scales:
         while block < side:
-            best, block = max_pool2d(best[None], 2, ceil_mode=True)[0], 2 * block
+            best, block = _halve_by_maximum(best), 2 * block
         highest = _pool(best, round(_RADIUS * sigma / block))[: len(gain), : gain.shape[1]]
         rows, columns = torch.nonzero((gain >= highest) & (gain > floor), as_tuple=True)
         means = (torch.stack([columns, rows], -1) + 0.5).to(gain.dtype) * block
@@ -95,22 +95,15 @@ def _local_maxima(residual: Tensor, regions: RegionMap | None, floor: float) -> 
 
 def _scales(residual: Tensor, labels: Tensor | None) -> Iterator[_Scale]:
     """Evaluate each size of Gaussians, as long as the image has a block of it."""
+    pixels = torch.cat([residual, torch.ones_like(residual[:1])])
     for block, sigmas in _SIGMAS.items():
         if min(residual.shape[1:]) < block:
             return
-        planes, mask, middle_labels = residual, torch.ones_like(residual[:1]), labels
-        if labels is not None and block > 1:
-            # of a block that a contour crosses, only the pixels of one region count
-            middle_labels = _middles(labels, block)
-            height, width = (length * block for length in middle_labels.shape)
-            pixels = labels[:height, :width].unflatten(1, (-1, block)).unflatten(0, (-1, block))
-            mask = (pixels == middle_labels[:, None, :, None]).to(residual.dtype).view(1, height, width)
-            planes = residual[:, :height, :width] * mask
-        planes = torch.cat([_average(planes, block), _average(mask, block)])
+        planes = _average(pixels, labels, block)
+        middle_labels = None if labels is None else _middles(labels, block).contiguous()
         for sigma in sigmas:
-            products, norm = _blur(planes, middle_labels, sigma / block)
-            colors = products / norm
-            yield _Scale(sigma, block, (products * colors).sum(0) * block**2, colors)
+            gain, colors = _evaluate(planes, middle_labels, sigma / block)
+            yield _Scale(sigma, block, gain.mul_(block**2), colors)
 
 
 def _scatter(plane: Tensor) -> Tensor:
@@ -129,41 +122,42 @@ def _middles(plane: Tensor, block: int) -> Tensor:
     return plane[block // 2 : height : block, block // 2 : width : block]
 
 
-def _average(planes: Tensor, block: int) -> Tensor:
-    """Return the means of blocks, whose side is a power of 2."""
-    return planes if block == 1 else _average(halve(planes), block // 2)
+def _average(planes: Tensor, labels: Tensor | None, block: int) -> Tensor:
+    """Return the means of whole blocks, whose side is a power of 2.
+
+    Of a block that a contour crosses, pixels that differ in label from its middle count as 0.
+    """
+    if labels is not None and block > 1:
+        if planes.is_cpu:
+            from .pursuit_loops import average  # loads numba
+
+            return average(planes, labels, block)
+        middles = _middles(labels, block)
+        height, width = (length * block for length in middles.shape)
+        blocks = labels[:height, :width].unflatten(1, (-1, block)).unflatten(0, (-1, block))
+        planes = planes[:, :height, :width] * (blocks == middles[:, None, :, None]).view(height, width)
+    while block > 1:
+        planes, block = halve(planes), block // 2
+    return planes
 
 
-def _blur(planes: Tensor, labels: Tensor | None, sigma: float) -> tuple[Tensor, Tensor]:
-    """Filter planes along columns, then along rows, each time over the pixels of the same label alone.
+def _evaluate(planes: Tensor, labels: Tensor | None, sigma: float) -> tuple[Tensor, Tensor]:
+    """Return gain and colours of Gaussians at the pixels of planes, the last of which has the pixels' weights.
 
-    So a pixel sees those of its region that it reaches by a column and a row. The last plane is filtered by the square
-    of the filter.
-
-    Returns:
-        The other planes, and the last.
+    Filters run along columns, then along rows, each time over the pixels of the same label alone. So a Gaussian sees
+    those of its region that it reaches by a column and a row.
     """
     # the square of a Gaussian is one, too, narrower by sqrt 2
-    reach, norm_sigma = math.ceil(_REACH * sigma), sigma / math.sqrt(2.0)
-    if takes_triton(planes):
-        from .cuda import blur  # loads triton
+    arguments = planes, labels, sigma, sigma / math.sqrt(2.0), math.ceil(_REACH * sigma)
+    if not takes_triton(planes):
+        from .pursuit_loops import evaluate  # loads numba
 
-        planes = blur(planes, None if labels is None else labels.contiguous(), sigma, norm_sigma, reach)
-        return planes[:-1], planes[-1]
-    taps, norm_taps, is_same = gaussian_taps(sigma, reach), gaussian_taps(norm_sigma, reach), planes.new_ones(())
-    for dim in (1, 2):
-        blurred, length = planes.clone(), planes.shape[dim]
-        for distance in range(1, min(len(taps), length)):
-            count = length - distance
-            if labels is not None:
-                before, after = (labels.narrow(dim - 1, start, count) for start in (0, distance))
-                is_same = torch.eq(before, after, out=torch.empty_like(before))  # as floats: masks need no conversion
-            for source, target in ((distance, 0), (0, distance)):
-                values, sums = planes.narrow(dim, source, count), blurred.narrow(dim, target, count)
-                sums[:-1].addcmul_(values[:-1], is_same, value=taps[distance])
-                sums[-1].addcmul_(values[-1], is_same, value=norm_taps[distance])
-        planes = blurred
-    return planes[:-1], planes[-1]
+        return evaluate(*arguments)
+    from .cuda import blur  # loads triton
+
+    blurred = blur(*arguments)
+    colors = blurred[:-1] / blurred[-1]
+    return (blurred[:-1] * colors).sum(0), colors
 
 
 def _pool(plane: Tensor, radius: int) -> Tensor:
@@ -176,6 +170,13 @@ def _pool(plane: Tensor, radius: int) -> Tensor:
         length = plane.shape[dim] - 2 * radius
         plane = functools.reduce(torch.maximum, (plane.narrow(dim, start, length) for start in range(2 * radius + 1)))
     return plane
+
+
+def _halve_by_maximum(plane: Tensor) -> Tensor:
+    """Return the largest value, none negative, of each block of 2 x 2, of which the last may have less."""
+    plane = pad(plane, [0, plane.shape[1] % 2, 0, plane.shape[0] % 2])
+    rows = torch.maximum(plane[::2], plane[1::2])
+    return torch.maximum(rows[:, ::2], rows[:, 1::2])
 
 
 def halve(planes: Tensor) -> Tensor:

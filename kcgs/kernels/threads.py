@@ -45,17 +45,6 @@ def threads_for_kernels(pixels: int) -> Iterator[None]:
         _num_threads.reset(token)
 
 
-@contextmanager
-def threads_for_torch() -> Iterator[None]:
-    """Within `threads_for_kernels`, give torch the threads, too, for a few long operations in a row."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(num_threads())
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
 def image_threads_for_kernels(function: Callable[Concatenate[Tensor, P], R]) -> Callable[Concatenate[Tensor, P], R]:
     """Decorate a function of an image, (..., H, W), to run within :func:`threads_for_kernels`."""
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from kcgs import fit
-from kcgs.fitting.pursuit import _scales, propose
+from kcgs.fitting.pursuit import _average, _evaluate, _scales, propose
 from kcgs.functional import RegionMap, lookup_regions, region_splat
 from kcgs.nn import GaussianField
 
@@ -47,6 +47,18 @@ def dense_gain(residual: Tensor, mask: Tensor, x: float, y: float, sigma: float)
     return float(((weight * residual).sum((1, 2)) ** 2).sum() / (weight**2).sum())
 
 
+def dense_filter(planes: Tensor, labels: Tensor, sigma: float) -> tuple[Tensor, Tensor]:
+    """Return the gain and the colours of Gaussians at pixels, by a matrix for each column and each row."""
+    for dim in (1, 2):
+        lines, places = labels.movedim(dim - 1, 1), torch.arange(planes.shape[dim])
+        distance = (places[:, None] - places).abs()
+        weight = (lines[:, :, None] == lines[:, None]) & (distance <= np.ceil(3 * sigma))
+        weights = [weight * torch.exp(-power * (distance.double() / sigma) ** 2) for power in (0.5, 0.5, 0.5, 1.0)]
+        planes = (torch.stack(weights) @ planes.movedim(dim, 2)[..., None])[..., 0].movedim(2, dim)
+    colors = planes[:3] / planes[3]
+    return (planes[:3] * colors).sum(0), colors
+
+
 class TestGain:
     @pytest.mark.parametrize("regions", [None, halves((40, 52))])
     @pytest.mark.parametrize("channels", [1, 8])
@@ -63,6 +75,31 @@ class TestGain:
             mask = torch.ones(40, 52) if labels is None else labels == labels[int(y), int(x)]
             expected = dense_gain(residual, mask, x, y, sigma)
             assert float(gain.max()) == pytest.approx(expected, rel=0.02 if block == 1 else 0.15)
+
+    @pytest.mark.parametrize("size", [(13, 57), (1, 3), (40, 2)])
+    @pytest.mark.parametrize("has_labels", [False, True])
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    def test_filters_see_one_label_along_columns_and_rows(
+        self, size: tuple[int, int], has_labels: bool, dtype: torch.dtype
+    ) -> None:
+        generator = torch.Generator().manual_seed(0)
+        planes = torch.rand(4, *size, generator=generator).to(dtype)
+        labels = torch.randint(0, 2, size, generator=generator).to(dtype)
+        expected = dense_filter(planes.double(), labels if has_labels else torch.zeros_like(labels), 1.3)
+        for actual, values in zip(_evaluate(planes, labels if has_labels else None, 1.3), expected, strict=True):
+            torch.testing.assert_close(actual, values.to(dtype))
+
+    @pytest.mark.parametrize("size", [(21, 70), (8, 9)])
+    @pytest.mark.parametrize("block", [2, 4, 8])
+    def test_blocks_are_averaged_over_the_label_of_their_middle(self, size: tuple[int, int], block: int) -> None:
+        generator = torch.Generator().manual_seed(0)
+        planes, labels = torch.rand(3, *size, generator=generator), torch.randint(0, 2, size, generator=generator)
+        averages = _average(planes, labels.float(), block)
+        assert averages.shape == (3, size[0] // block, size[1] // block)
+        for row, column in np.ndindex(*averages.shape[1:]):
+            rows, columns = (slice(block * k, block * k + block) for k in (row, column))
+            is_same = labels[rows, columns] == labels[rows, columns][block // 2, block // 2]
+            torch.testing.assert_close(averages[:, row, column], (planes[:, rows, columns] * is_same).mean((1, 2)))
 
     def test_finds_the_gaussian_that_is_there(self) -> None:
         mean, cholesky = torch.tensor([[20.5, 14.5]]), torch.tensor([[1.8, 0.0, 1.8]])
@@ -207,7 +244,7 @@ def test_a_small_region_does_not_stay_black() -> None:
 class TestTriton:
     """TRITON_INTERPRET is read when triton is imported, so it must not be set in the process of the other tests."""
 
-    def test_filters_as_torch_operations(self) -> None:
+    def test_filters_as_compiled_loops(self) -> None:
         environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"}
         if not torch.cuda.is_available():
             environment |= {"TRITON_INTERPRET": "1", "OMP_NUM_THREADS": "1"}

@@ -12,13 +12,13 @@ DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 @pytest.mark.parametrize("size", [(13, 57), (1, 3), (40, 2)])
 @pytest.mark.parametrize("has_labels", [False, True])
-def test_filters_as_torch_operations(size: tuple[int, int], has_labels: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_filters_as_compiled_loops(size: tuple[int, int], has_labels: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     generator = torch.Generator().manual_seed(0)
     planes = torch.rand(4, *size, generator=generator).to(DEVICE)
     labels = torch.randint(0, 2, size, generator=generator).to(planes) if has_labels else None
     pair = []
     for is_taken in (False, True):
         monkeypatch.setattr(pursuit, "takes_triton", lambda *tensors: is_taken)  # noqa: B023
-        pair.append(torch.cat([part.view(-1, *size) for part in pursuit._blur(planes, labels, 1.3)]))
+        pair.append(torch.cat([part.view(-1, *size) for part in pursuit._evaluate(planes, labels, 1.3)]))
     torch.testing.assert_close(*pair)
-    assert not torch.equal(pair[0][3], pair[0][2])
+    assert not torch.equal(pair[0][0], pair[0][1])

@@ -18,7 +18,7 @@ import torch
 
 from kcgs import GaussianField, Scene, load
 from kcgs.editing import delete_region, move_region
-from kcgs.kernels import threads_for_kernels, threads_for_torch
+from kcgs.kernels import threads_for_kernels
 from kcgs.kernels.compiled import Program
 from kcgs.kernels.tasks import first_task, next_task, phases, run_tasks
 from kcgs.kernels.threads import num_threads
@@ -48,9 +48,6 @@ class TestThreads:
         with threads_for_kernels(24 * 32):
             with threads_for_kernels(24 * 32):
                 assert (torch.get_num_threads(), num_threads()) == (1, 3)
-            assert (torch.get_num_threads(), num_threads()) == (1, 3)
-            with threads_for_torch():
-                assert torch.get_num_threads() == num_threads() == 3
             assert (torch.get_num_threads(), num_threads()) == (1, 3)
         assert torch.get_num_threads() == num_threads() == 3
 

@@ -1,0 +1,141 @@
+"""The filters of `pursuit.py`, compiled: all that a row needs, while a processor's cache holds it.
+
+With torch operations a search in an image of 854 x 480 with a map takes 50 ms in place of 23, on two cores.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kcgs.functional.blur import gaussian_taps
+from kcgs.kernels.compiled import Program, inner
+from kcgs.kernels.tasks import first_task, next_task, ranges, run_tasks
+
+program = Program("search for new Gaussians")
+
+# least rows of a task
+_ROWS = 16
+
+
+def average(planes: Tensor, labels: Tensor, block: int) -> Tensor:
+    """Sum the pixels of each block that have the label of its middle, and divide by the number of all: (K, h, w).
+
+    Args:
+        planes: (K, H, W), contiguous, floating.
+        labels: (H, W), contiguous, of the same type.
+        block: side of the blocks.
+    """
+    count, height, width = planes.shape
+    averages = planes.new_empty(count, height // block, width // block)
+    arguments = planes.numpy(), labels.numpy(), block, averages.numpy()
+    run_tasks(lambda tasks, counters: _average(*arguments, tasks, counters), ranges(height // block, _ROWS // block))
+    return averages
+
+
+@program.entry
+def _average(planes, labels, block, averages, tasks, counters):  # type: ignore[no-untyped-def]
+    """Fill ranges of rows."""
+    count, _, width = averages.shape
+    one, share = labels.dtype.type(1.0), labels.dtype.type(1.0 / block**2)
+    middles, is_same = np.empty(width * block, labels.dtype), np.empty(width * block, labels.dtype)
+    sums = np.empty((count, width * block), labels.dtype)
+    k = first_task(tasks, counters)
+    while k >= 0:
+        for row in range(tasks[k, 1], tasks[k, 2]):
+            for x in range(width * block):
+                middles[x] = labels[row * block + block // 2, x // block * block + block // 2]
+            sums.fill(0.0)
+            for y in range(row * block, row * block + block):
+                _compare(middles, labels[y], is_same)
+                for plane in range(count):
+                    _add(sums[plane], planes[plane, y], is_same, one)
+            for plane in range(count):
+                for column in range(width):
+                    total = sums[plane, column * block]
+                    for x in range(column * block + 1, column * block + block):
+                        total += sums[plane, x]
+                    averages[plane, row, column] = share * total
+        k = next_task(tasks, counters)
+
+
+def evaluate(
+    planes: Tensor, labels: Tensor | None, sigma: float, norm_sigma: float, reach: int
+) -> tuple[Tensor, Tensor]:
+    """Filter planes, (K, H, W), along columns, then along rows, each time over the pixels of the same label alone.
+
+    Args:
+        planes: contiguous, floating, on any device.
+        labels: (H, W), contiguous, of the same type; None: all pixels are of one.
+        sigma: standard deviation of the filter, in pixels.
+        norm_sigma: that of the last plane's.
+        reach: of both filters, in pixels.
+
+    Returns:
+        The sum of the squares of the other planes, (H, W), and these planes, (K - 1, H, W), both divided by the last.
+    """
+    values = planes.cpu().numpy()
+    marks = np.empty((0, 0), values.dtype) if labels is None else labels.cpu().numpy()
+    taps = np.array([gaussian_taps(sigma, reach)] * (len(values) - 1) + [gaussian_taps(norm_sigma, reach)])
+    gain, colors = np.zeros_like(values[0]), np.empty_like(values[1:])
+    arguments = values, marks, taps.astype(values.dtype), gain, colors
+    run_tasks(lambda tasks, counters: _evaluate(*arguments, tasks, counters), ranges(len(gain), _ROWS))
+    return torch.from_numpy(gain).to(planes.device), torch.from_numpy(colors).to(planes.device)
+
+
+@program.entry
+def _evaluate(planes, labels, taps, gain, colors, tasks, counters):  # type: ignore[no-untyped-def]
+    """Fill ranges of rows; each plane has its taps."""
+    count, height, width = planes.shape
+    reach = taps.shape[1] - 1
+    columns, rows = np.empty((count, width), planes.dtype), np.empty((count, width), planes.dtype)
+    is_same = np.ones(width, planes.dtype)
+    k = first_task(tasks, counters)
+    while k >= 0:
+        for y in range(tasks[k, 1], tasks[k, 2]):
+            _copy(planes[:, y], columns)
+            for other in range(max(y - reach, 0), min(y + reach + 1, height)):
+                if other != y:
+                    if len(labels) > 0:
+                        _compare(labels[y], labels[other], is_same)
+                    for plane in range(count):
+                        _add(columns[plane], planes[plane, other], is_same, taps[plane, abs(other - y)])
+            _copy(columns, rows)
+            for distance in range(1, min(reach + 1, width)):
+                if len(labels) > 0:
+                    _compare(labels[y, :-distance], labels[y, distance:], is_same)
+                for plane in range(count):
+                    _add(rows[plane, :-distance], columns[plane, distance:], is_same, taps[plane, distance])
+                    _add(rows[plane, distance:], columns[plane, :-distance], is_same, taps[plane, distance])
+            for plane in range(count - 1):
+                _divide(rows[plane], rows[count - 1], colors[plane, y], gain[y])
+        k = next_task(tasks, counters)
+
+
+@inner
+def _compare(labels, others, is_same):  # type: ignore[no-untyped-def]
+    """Set a row to 1 where two of labels are equal, and to 0 elsewhere."""
+    for x in range(len(labels)):
+        is_same[x] = labels[x] == others[x]
+
+
+@inner
+def _copy(values, target):  # type: ignore[no-untyped-def]
+    for plane in range(len(values)):
+        for x in range(values.shape[1]):
+            target[plane, x] = values[plane, x]
+
+
+@inner
+def _add(sums, values, is_same, tap):  # type: ignore[no-untyped-def]
+    for x in range(len(sums)):
+        sums[x] += tap * is_same[x] * values[x]
+
+
+@inner
+def _divide(products, norm, colors, gain):  # type: ignore[no-untyped-def]
+    """Fill a row of colours, and add their gain to that of other channels."""
+    for x in range(len(gain)):
+        colors[x] = products[x] / norm[x]
+        gain[x] += products[x] * colors[x]
