@@ -8,8 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from kcgs.functional import region_splat
-from kcgs.functional.weights import weighted_sums
+from kcgs.functional.weights import inner_products
 
 from .descent import DRAFT_CUTOFF
 from .state import FitState
@@ -17,8 +16,7 @@ from .state import FitState
 
 @torch.no_grad()
 def lowest_impact(
-    render: Callable[[Tensor, Tensor, Tensor], Tensor],
-    means: Tensor,
+    products: Callable[[Tensor, Tensor], Tensor],
     cholesky: Tensor,
     colors: Tensor,
     count: int,
@@ -33,8 +31,7 @@ def lowest_impact(
     overlaps, and of the best length.
 
     Args:
-        render: of the Gaussians in other shapes and colours, from means, cholesky and colors.
-        means: (N, 2).
+        products: from cholesky and colors to the inner products of the Gaussians and their render, (N, C).
         cholesky: (N, 3).
         colors: (N, C).
         count: how many to remove.
@@ -47,20 +44,16 @@ def lowest_impact(
     energy = weight * colors.square().sum(1) * area[:, 0]
     is_strong = torch.ones_like(energy, dtype=torch.bool)
     is_strong[energy.argsort(stable=True)[: len(energy) // 2]] = False
-    norm = (0.5 * area).rsqrt()
-
-    def render_narrow(factors: Tensor) -> Tensor:
-        return render(means, cholesky / math.sqrt(2.0), norm * factors)
-
-    strong, overlaps = weighted_sums(render_narrow, is_strong[:, None].to(colors))
-    crowding = 1.0 + (overlaps(strong) - is_strong[:, None].to(colors)).clamp_min(0.0)
+    norm, factors = (0.5 * area).rsqrt(), is_strong[:, None].to(colors)
+    overlaps = norm * products(cholesky / math.sqrt(2.0), norm * factors)
+    crowding = 1.0 + (overlaps - factors).clamp_min(0.0)
     removed = torch.zeros_like(is_strong)
     removed[(energy / crowding[:, 0]).argsort(stable=True)[:count]] = True
-    removed_render, products = weighted_sums(lambda colors: render(means, cholesky, colors), colors * removed[:, None])
-    step = products(removed_render) / (area * crowding) * ~removed[:, None]
-    change = render(means, cholesky, step)
-    tiny = torch.finfo(change.dtype).tiny
-    length = (change * removed_render).sum() / change.square().sum().clamp_min(tiny)
+    removed_products = products(cholesky, colors * removed[:, None])
+    step = removed_products / (area * crowding) * ~removed[:, None]
+    # inner products of the step's render, with what is removed and with itself
+    tiny = torch.finfo(step.dtype).tiny
+    length = (step * removed_products).sum() / (step * products(cholesky, step)).sum().clamp_min(tiny)
     return removed, colors + length * step
 
 
@@ -72,13 +65,13 @@ def remove_gaussians(state: FitState, count: int) -> None:
     field, problem = state.scene.field, state.problem
     means, cholesky, colors = field.means.detach(), field.cholesky.detach(), field.colors.detach()
 
-    def render(means: Tensor, cholesky: Tensor, colors: Tensor) -> Tensor:
-        return region_splat(
+    def products(cholesky: Tensor, colors: Tensor) -> Tensor:
+        return inner_products(
             means, cholesky, colors, field.region_ids, state.scene.regions,
             size=problem.size, cutoff=DRAFT_CUTOFF, backend=problem.config.backend,
         )  # fmt: skip
 
     weight = torch.ones_like(means[:, 0]) if problem.objective is None else problem.objective.weigh(means, cholesky)
-    removed, new_colors = lowest_impact(render, means, cholesky, colors, count, weight)
+    removed, new_colors = lowest_impact(products, cholesky, colors, count, weight)
     colors.copy_(new_colors)
     state.optimizer.keep(field, ~removed)

@@ -97,7 +97,11 @@ class FrameDescent:
         visibility, self.overlap = self._overlap()
         weights = error_weights(Gaussians(means, cholesky, colors), self.objective) * visibility
         weights = torch.where(self.movable_rows, weights, _FIXED_WEIGHT)
-        mask, new_colors = lowest_impact(self._render, means, cholesky, colors, count, weights)
+
+        def products(cholesky: Tensor, colors: Tensor) -> Tensor:
+            return self.target.inner_products(self.splats._replace(cholesky=cholesky, colors=colors))
+
+        mask, new_colors = lowest_impact(products, cholesky, colors, count, weights)
         colors = torch.where(self.movable_rows[:, None], new_colors, colors).masked_fill(mask[:, None], 0.0)
         self.newton.velocity[mask], self.movable_rows = 0.0, self.movable_rows | mask
 

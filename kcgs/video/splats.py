@@ -12,7 +12,7 @@ from torch import Tensor
 from kcgs.fitting import FitConfig
 from kcgs.fitting.descent import DRAFT_CUTOFF
 from kcgs.functional import RegionMap, region_splat
-from kcgs.functional.weights import weighted_sums
+from kcgs.functional.weights import inner_products, weighted_sums
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
@@ -75,8 +75,15 @@ class Target:
 
     def render(self, splats: Splats) -> Tensor:
         """Render (C, H, W), with the cutoff of a draft."""
-        cutoff = max(self.config.cutoff, DRAFT_CUTOFF)
-        return region_splat(*splats, size=self.size, cutoff=cutoff, backend=self.config.backend)
+        return region_splat(*splats, size=self.size, cutoff=self._cutoff, backend=self.config.backend)
+
+    def inner_products(self, splats: Splats) -> Tensor:
+        """Sum the render over the weights of each Gaussian, (N, C)."""
+        return inner_products(*splats, size=self.size, cutoff=self._cutoff, backend=self.config.backend)
+
+    @property
+    def _cutoff(self) -> float:
+        return max(self.config.cutoff, DRAFT_CUTOFF)
 
     def squared_error(self, splats: Splats) -> Tensor:
         """Return the squared error of each pixel, (H, W), channels averaged."""

@@ -9,6 +9,7 @@ from torch import Tensor
 from kcgs import RegionMap, fit
 from kcgs.fitting.removal import lowest_impact
 from kcgs.functional import psnr, region_splat
+from kcgs.functional.weights import inner_products
 
 SIZE = (40, 60)
 
@@ -26,10 +27,14 @@ class RemovalCase:
     def render(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> Tensor:
         return region_splat(means, cholesky, colors, self.ids, self.regions, size=SIZE, cutoff=1e-3)
 
+    def products(self, cholesky: Tensor, colors: Tensor) -> Tensor:
+        arguments = self.means, cholesky, colors, self.ids, self.regions
+        return inner_products(*arguments, size=SIZE, cutoff=1e-3, backend="auto")
+
     def remove(self, count: int, weight: Tensor | None = None) -> tuple[list[int], Tensor, float, float]:
         """Return who is removed, the colours of all, and the squared error without and with these colours."""
         weight = torch.ones(len(self.means)) if weight is None else weight
-        removed, colors = lowest_impact(self.render, self.means, self.cholesky, self.colors, count, weight)
+        removed, colors = lowest_impact(self.products, self.cholesky, self.colors, count, weight)
         image = self.render(self.means, self.cholesky, self.colors)
         errors = [
             float((self.render(self.means, self.cholesky, c * ~removed[:, None]) - image).square().sum())
