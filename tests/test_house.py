@@ -31,6 +31,7 @@ LAYERS = [
     {"functional"},
     {"kernels", "engine", "plots"},
     {"maps"},
+    {"compiled"},
     {"_image", "_labels"},
     {"_atomic", "_check", "_decode", "_memory", "_progress", "_repr", "_suffixes", "_warn"},
     {"errors", "_rows"},

@@ -7,10 +7,10 @@ from torch import Tensor
 from torch.nn.functional import pad
 from torch.optim.lr_scheduler import LambdaLR
 
+from kcgs.compiled import threads_for_kernels
 from kcgs.fitting.optimizers import cosine_decay
 from kcgs.functional import RegionMap, region_splat
 from kcgs.functional.weights import weighted_sums
-from kcgs.kernels import threads_for_kernels
 from kcgs.nn import GaussianField
 from kcgs.nn.field import join
 from kcgs.optim import GaussianAdam

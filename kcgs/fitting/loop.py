@@ -13,8 +13,9 @@ import torch
 
 from kcgs._progress import Progress
 from kcgs._warn import warn_user
+from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
-from kcgs.kernels import prepare, settle, threads_for_kernels, without_waiting
+from kcgs.kernels import prepare, settle, without_waiting
 
 from .checkpoint import Checkpoint
 from .clock import Clock

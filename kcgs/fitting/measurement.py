@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from kcgs.kernels.compiled import Program, inner
+from kcgs.compiled.program import Program, inner
 
 program = Program("measurement of a fit")
 

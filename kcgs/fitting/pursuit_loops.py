@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcgs.compiled.program import Program, inner
+from kcgs.compiled.tasks import first_task, next_task, ranges, run_tasks
 from kcgs.functional.blur import gaussian_taps
-from kcgs.kernels.compiled import Program, inner
-from kcgs.kernels.tasks import first_task, next_task, ranges, run_tasks
 
 program = Program("search for new Gaussians")
 

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from kcgs.compiled.program import Program, inner
+from kcgs.compiled.tasks import first_task, next_task
 from kcgs.functional.metrics import K1, K2
-from kcgs.kernels.compiled import Program, inner
-from kcgs.kernels.tasks import first_task, next_task
 
 # half the window of SSIM, in pixels
 MARGIN = 5

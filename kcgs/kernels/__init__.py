@@ -16,10 +16,8 @@ from .interface import SplatInputs, Steps, with_autograd
 from .membership import Membership
 from .registry import BACKENDS, check_backend, prepare, resolve, takes_triton
 from .resampled import Resampled
-from .threads import image_threads_for_kernels, threads_for_kernels
 
 __all__ = [
-    "BACKENDS", "Membership", "Resampled", "SplatInputs", "Steps", "check_backend",
-    "image_threads_for_kernels", "prepare", "resolve", "settle", "takes_triton", "threads_for_kernels",
-    "with_autograd", "without_waiting",
+    "BACKENDS", "Membership", "Resampled", "SplatInputs", "Steps", "check_backend", "prepare", "resolve", "settle",
+    "takes_triton", "with_autograd", "without_waiting",
 ]  # fmt: skip

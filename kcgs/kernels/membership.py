@@ -176,7 +176,8 @@ class Membership:
             return make_coverage(
                 self.index, self.num_regions, *find_widths(self.index, self.num_regions, self.softness)
             )
-        from .tasks import ranges, run_tasks  # loads numba
+        from kcgs.compiled.tasks import ranges, run_tasks  # loads numba
+
         from .windows import fill_planes, list_regions
 
         index, (place, reaches) = _array(self.index), self._place_tiles(TILE)
@@ -214,7 +215,8 @@ class Membership:
 
         Windows may reach beyond the image, where s_r has no meaning.
         """
-        from .tasks import ranges, run_tasks  # loads numba
+        from kcgs.compiled.tasks import ranges, run_tasks  # loads numba
+
         from .windows import fill_weights
 
         weights = np.zeros((len(region), *span))

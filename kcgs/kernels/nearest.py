@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .compiled import Program, inner
+from kcgs.compiled.program import Program, inner
 
 program = Program("tables of label maps")
 

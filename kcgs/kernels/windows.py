@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from .compiled import Program, inner
-from .tasks import first_task, next_task
+from kcgs.compiled.program import Program, inner
+from kcgs.compiled.tasks import first_task, next_task
 
 program = Program("tables of label maps")
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from kcgs.kernels.compiled import Program, inner
+from kcgs.compiled.program import Program, inner
 
 program = Program("optimizer")
 

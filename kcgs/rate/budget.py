@@ -16,6 +16,7 @@ from kcgs._progress import Progress
 from kcgs._repr import brief
 from kcgs.codec import decode
 from kcgs.codec.scenes import SceneWriter
+from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
 from kcgs.fitting import FitConfig, FitResult, HistoryEntry
 from kcgs.fitting.loop import fit_problem
@@ -25,7 +26,6 @@ from kcgs.fitting.region_report import report_regions
 from kcgs.functional import RegionMap, edge_band, merge_regions
 from kcgs.functional.labels import contour_edges
 from kcgs.functional.merging import pairs_to_merge
-from kcgs.kernels import threads_for_kernels
 from kcgs.nn import GaussianField
 from kcgs.nn.field import scaled_gaussians
 from kcgs.nn.renderer import area_mean

@@ -16,11 +16,11 @@ from kcgs._repr import brief
 from kcgs.codec import decode
 from kcgs.codec.gaussians.quantize import QPS, Quantizer
 from kcgs.codec.scenes import QUALITIES, SceneWriter
+from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
 from kcgs.fitting.config import Objective
 from kcgs.fitting.objective import MsSsimObjective, make_objective
 from kcgs.functional import psnr
-from kcgs.kernels import threads_for_kernels
 from kcgs.scene import Scene
 
 from .descent import RateDistortionDescent

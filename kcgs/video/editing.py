@@ -7,11 +7,11 @@ from collections.abc import Iterable, Sequence
 import torch
 from torch import Tensor
 
+from kcgs.compiled import threads_for_kernels
 from kcgs.editing.masks import check_offset, shift_labels
 from kcgs.editing.selection import unique_region_ids
 from kcgs.fitting import FitConfig
 from kcgs.functional import RegionMap
-from kcgs.kernels import threads_for_kernels
 from kcgs.nn import GaussianField
 from kcgs.nn.field import join
 from kcgs.scene import Scene, check_batch

@@ -15,11 +15,11 @@ from torch.nn.functional import avg_pool2d, pad
 
 from kcgs._check import check_count
 from kcgs._progress import Progress
+from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
 from kcgs.fitting import FitConfig, fit
 from kcgs.fitting.problem import check_image_and_regions
 from kcgs.functional import RegionMap, lookup_regions
-from kcgs.kernels import threads_for_kernels
 from kcgs.scene import Scene
 
 from .descent import FrameDescent

@@ -84,7 +84,7 @@ class TestMsSsim:
         slope = expected.apply(residual)
         slopes = []
         for threads in (1, 2):
-            monkeypatch.setattr("kcgs.kernels.tasks.num_threads", lambda count=threads: count)
+            monkeypatch.setattr("kcgs.compiled.tasks.num_threads", lambda count=threads: count)
             slopes.append(objective.apply(residual.float()))
         torch.testing.assert_close(slopes[0].double(), slope, rtol=0, atol=1e-3 * float(slope.abs().max()))
         assert torch.equal(*slopes)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from kcgs.kernels.compiled import inner
+from kcgs.compiled.program import inner
 
 # dx of the first and the last pixel of the template in each row, from the pixel's own row upwards
 _SPANS = ((-8, -1), (-8, 7), (-7, 8), (-6, 7), (-5, 6), (-3, 4), (-2, 3))

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from kcgs.kernels.compiled import Program, inner
+from kcgs.compiled.program import Program, inner
 
 from .contexts import (
     LEFT,

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 
-from ..compiled import inline
+from kcgs.compiled.program import inline
+
 from ..whitened import Z_LIMIT
 from .layout import (
     CHANGE,

@@ -6,7 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..compiled import inner
+from kcgs.compiled.program import inner
+
 from .layout import COLOR_FACTOR, L11, L21, L22, LEVEL, SCALE
 
 

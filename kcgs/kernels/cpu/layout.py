@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-from ..compiled import Program
+from kcgs.compiled.program import Program
 
 program = Program("CPU kernel")
 

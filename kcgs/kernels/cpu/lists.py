@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 
-from ..compiled import inline, inner
-from ..tasks import first_task, next_task
+from kcgs.compiled.program import inline, inner
+from kcgs.compiled.tasks import first_task, next_task
+
 from ..whitened import MEAN_LIMIT, SCALE_LIMITS
 from .ellipse import block_rows, bounded, enter, row_halves, tile_rows
 from .layout import (

@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from ..compiled import inner, part
-from ..tasks import first_task, next_task
+from kcgs.compiled.program import inner, part
+from kcgs.compiled.tasks import first_task, next_task
+
 from .gradients import sum_terms
 from .layout import TILE_COLS, program
 from .lists import first_head, first_node_block, first_tile

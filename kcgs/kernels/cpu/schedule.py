@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..tasks import chunks, phases
+from kcgs.compiled.tasks import chunks, phases
 
 # columns of a task behind its START; or, of a sum, the first Gaussian and the last + 1 in FIRST_FIELD
 KIND = 1  # ADDS, GATHERS, both; 0: a sum

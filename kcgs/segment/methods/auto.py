@@ -7,9 +7,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from kcgs.compiled import image_threads_for_kernels
 from kcgs.functional import merge_regions
 from kcgs.functional.merging import Labels
-from kcgs.kernels import image_threads_for_kernels
 from kcgs.segment.cleanup import Cleanup, clean, merge_similar, to_regions
 from kcgs.segment.images import check_segment_image, lab_sums, rgb_to_lab
 from kcgs.segment.registry import register

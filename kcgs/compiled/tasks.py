@@ -26,7 +26,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from .compiled import inner
+from .program import inner
 from .threads import num_threads
 
 # columns of tasks and of counters

@@ -19,12 +19,12 @@ import numpy as np
 import pytest
 
 import kcgs
-from kcgs.kernels import compiled
-from kcgs.kernels.compiled import Program, inner
+from kcgs.compiled import program
+from kcgs.compiled.program import Program, inner
 
 ROOT = Path(kcgs.__file__).parent
 LOOPS = """
-from kcgs.kernels.compiled import Program
+from kcgs.compiled.program import Program
 
 from .constants import FACTOR
 
@@ -42,7 +42,7 @@ def twice(value):  # type: ignore[no-untyped-def]
 
 def double_in(cache: Path, monkeypatch: pytest.MonkeyPatch) -> float:
     """Run a loop of a new program, as a new process would."""
-    monkeypatch.setattr(compiled._config, "CACHE_DIR", str(cache))
+    monkeypatch.setattr(program._config, "CACHE_DIR", str(cache))
 
     @Program("doubling").entry
     def double(values):  # type: ignore[no-untyped-def]
@@ -66,7 +66,7 @@ def test_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: 
         assert [double_in(tmp_path, monkeypatch) for _ in range(2)] == [3.0, 3.0]
     assert caplog.messages == ["kcgs: compiling the doubling, once on this machine"]
     assert len(list(tmp_path.rglob("*.nbc"))) == 1
-    monkeypatch.setattr(compiled._config, "CPU_NAME", "other")
+    monkeypatch.setattr(program._config, "CPU_NAME", "other")
     assert double_in(tmp_path, monkeypatch) == 3.0 and len(list(tmp_path.rglob("*.nbc"))) == 2
 
 
@@ -151,7 +151,7 @@ def test_two_processes_compile_at_once(tmp_path: Path) -> None:
 
 def test_constant_of_another_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two checkouts share what they compile, unless a module differs that the loop takes a constant from."""
-    monkeypatch.setattr(compiled._config, "CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(program._config, "CACHE_DIR", str(tmp_path / "cache"))
     for name, factor, num_files in (("first", 2.0, 1), ("second", 2.0, 1), ("third", 3.0, 2)):
         with monkeypatch.context() as patch:
             patch.syspath_prepend(make_scaling(tmp_path / name, factor))
@@ -204,10 +204,10 @@ def find_modules(loop: Any) -> set[str]:
 )
 def test_sources_hold_all_that_loops_name(file: Path) -> None:
     module = import_module(".".join(("kcgs", *file.with_suffix("").parts)))
-    loops = [value for value in vars(module).values() if isinstance(getattr(value, "_cache", None), compiled._Cache)]
+    loops = [value for value in vars(module).values() if isinstance(getattr(value, "_cache", None), program._Cache)]
     modules = set().union(*map(find_modules, loops))
     assert module.__name__ in modules
-    assert {Path(str(sys.modules[name].__file__)) for name in modules} <= compiled._find_sources(ROOT / file)
+    assert {Path(str(sys.modules[name].__file__)) for name in modules} <= program._find_sources(ROOT / file)
 
 
 @pytest.mark.parametrize(
@@ -219,7 +219,7 @@ def test_sources_hold_all_that_loops_name(file: Path) -> None:
     ],
 )
 def test_sources_that_no_loop_is_in(file: str, source: str) -> None:
-    sources = compiled._find_sources(ROOT / file)
+    sources = program._find_sources(ROOT / file)
     assert ROOT / source in sources
     assert all(path.is_relative_to(ROOT) for path in sources) and len(sources) < 25  # not all of kcgs, nor of others
 
@@ -227,11 +227,11 @@ def test_sources_that_no_loop_is_in(file: str, source: str) -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have other places")
 @pytest.mark.parametrize("user", [{"XDG_CACHE_HOME": "cache"}, {"HOME": ".", "XDG_CACHE_HOME": ""}])
 def test_folder_of_the_user(user: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compiled._config, "CACHE_DIR", "")
+    monkeypatch.setattr(program._config, "CACHE_DIR", "")
     for name, place in user.items():
         if place:
             monkeypatch.setenv(name, str(tmp_path / place))
         else:
             monkeypatch.delenv(name, raising=False)
-    folder = compiled._find_folder()
+    folder = program._find_folder()
     assert folder is not None and folder.is_relative_to(tmp_path)

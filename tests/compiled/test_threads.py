@@ -17,11 +17,10 @@ import pytest
 import torch
 
 from kcgs import GaussianField, Scene, load
+from kcgs.compiled import num_threads, threads_for_kernels
+from kcgs.compiled.program import Program
+from kcgs.compiled.tasks import first_task, next_task, phases, run_tasks
 from kcgs.editing import delete_region, move_region
-from kcgs.kernels import threads_for_kernels
-from kcgs.kernels.compiled import Program
-from kcgs.kernels.tasks import first_task, next_task, phases, run_tasks
-from kcgs.kernels.threads import num_threads
 from kcgs.rate import compress
 from kcgs.segment import segment
 
