@@ -18,7 +18,7 @@ from kcgs.page import scene_page
 from kcgs.zoo import entries, find
 
 # What readers look for first heads its page; other modules follow in the order in which the package imports them.
-FIRST = ("kcgs.scene", "kcgs.functional.splat", "kcgs.functional.regions", "kcgs.segment.registry")
+FIRST = ("kcgs.scene", "kcgs.functional.splat", "kcgs.maps.regions", "kcgs.segment.registry")
 # The scene that the front page shows first.
 FRONT = "coffee-1500"
 # What torch and pydantic call, not readers.

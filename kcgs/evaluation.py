@@ -12,7 +12,7 @@ from torch import Tensor
 from kcgs._image import as_image
 from kcgs.errors import InvalidArgument
 from kcgs.functional import ef_psnr, ef_ssim, ms_ssim, psnr, ssim
-from kcgs.functional.regions import as_region_map
+from kcgs.maps import as_region_map
 from kcgs.scene import Scene, check_scene
 
 

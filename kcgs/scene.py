@@ -19,7 +19,7 @@ from kcgs._repr import png, shorten
 from kcgs._suffixes import SCENE_FORMATS
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap
-from kcgs.functional.regions import as_region_map
+from kcgs.maps import as_region_map
 from kcgs.nn import GaussianField, RegionSplatRenderer
 from kcgs.nn.renderer import rendered_size
 

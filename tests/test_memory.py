@@ -30,7 +30,7 @@ import kcgs, torch
 from kcgs._image import as_image
 from kcgs.codec import decode_labels
 from kcgs.data import load_image, load_labels
-from kcgs.functional.labels import touching_pairs
+from kcgs.maps import touching_pairs
 
 def read(path, side):
     return {read}

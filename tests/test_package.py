@@ -16,7 +16,7 @@ PUBLIC = {
     "evaluate", "fit", "load", "save",
 }  # fmt: skip
 FUNCTIONAL = {"region_splat", "edge_band", "psnr", "ssim", "ms_ssim", "ef_psnr", "ef_ssim"}
-PRIVATE = {"cli", "kernels", "recipes"}
+PRIVATE = {"cli", "compiled", "kernels", "maps", "recipes"}
 # what only some calls need
 HEAVY = {
     "PIL", "constriction", "kornia", "matplotlib", "numba", "onnx", "onnx_ir", "onnxruntime", "ray", "rich", "scipy",

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from kcgs._check import check_count
 from kcgs._labels import check_labels
-from kcgs.functional.labels import compact
+from kcgs.maps import compact
 
 from .exact import Integers
 from .file import MAGIC, MAP_MAGIC, MAX_LABELS, MAX_REGIONS, MAX_SIDE, ByteReader, varint

@@ -9,9 +9,7 @@ import torch
 
 from kcgs._check import check_count
 from kcgs.functional import PairSoftness, RegionMap
-from kcgs.functional.labels import compact, touching_pairs
-from kcgs.functional.regions import wrap_labels
-from kcgs.functional.softness import MAX_SOFTNESS
+from kcgs.maps import MAX_SOFTNESS, compact, touching_pairs, wrap_labels
 
 from .adaptive import AdaptiveSymbol
 from .exact import Integers

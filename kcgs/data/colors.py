@@ -10,7 +10,7 @@ from torch import Tensor
 from kcgs._check import check_count
 from kcgs._image import as_image
 from kcgs._labels import check_labels
-from kcgs.functional.labels import touching_pairs
+from kcgs.maps import touching_pairs
 
 # step of the hue, the golden ratio less 1: any run of hues is spread over the circle
 _HUE_STEP = 0.6180339887498949

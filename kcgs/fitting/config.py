@@ -12,8 +12,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from kcgs._repr import shorten
 from kcgs.errors import InvalidArgument, InvalidArgumentType
-from kcgs.functional.softness import MAX_SOFTNESS
 from kcgs.kernels import BACKENDS
+from kcgs.maps import MAX_SOFTNESS
 
 Objective = Literal["auto", "psnr", "ms-ssim"]
 _USUAL_ITERATIONS = 700

@@ -13,7 +13,7 @@ from kcgs._check import check_count
 from kcgs._image import as_image
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap, edge_band
-from kcgs.functional.regions import as_region_map
+from kcgs.maps import as_region_map
 
 from .config import FitConfig
 from .objective import MsSsimObjective, make_objective

@@ -1,5 +1,7 @@
 """Stateless public operations: splatting, covariances, label maps, metrics."""
 
+from kcgs.maps import PairSoftness, RegionMap, edge_band, lookup_regions
+
 from .activation import activate_gaussians
 from .contour_fit import choose_softness
 from .covariance import (
@@ -8,11 +10,8 @@ from .covariance import (
     covariance_to_cholesky,
     scale_rotation_to_cholesky,
 )
-from .labels import edge_band, lookup_regions
 from .merging import merge_regions
 from .metrics import ef_psnr, ef_ssim, ms_ssim, psnr, ssim
-from .regions import RegionMap
-from .softness import PairSoftness
 from .splat import region_splat
 
 __all__ = [

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from .map_tables import MapOperands
+from kcgs.maps import MapOperands
 
 
 class SplatArguments(NamedTuple):

@@ -17,10 +17,7 @@ from torch import Tensor
 
 from kcgs._check import check_floating, check_number
 from kcgs._labels import check_labels
-from kcgs.maps import RADIUS_SIGMAS
-
-from .labels import contour_edges, unique_pairs
-from .softness import MAX_SOFTNESS
+from kcgs.maps import MAX_SOFTNESS, RADIUS_SIGMAS, contour_edges, unique_pairs
 
 CANDIDATES = (0.0, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)  # pixels: from hard to out of focus, by factors of about sqrt(2)
 _STEP = 0.05  # pixels that a softness between two candidates is rounded to

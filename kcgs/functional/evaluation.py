@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from kcgs.kernels import SplatInputs, Steps, resolve, with_autograd
+from kcgs.maps import tables_at
 
 from .arguments import SplatArguments
-from .map_tables import tables_at
 from .values import check_region_ids, check_values
 
 

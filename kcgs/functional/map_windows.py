@@ -1,4 +1,4 @@
-"""Membership of one tile at a time from labels and softness alone: `kcgs.kernels.membership` in standard operators.
+"""Membership of one tile at a time from labels and softness alone: `kcgs.maps.membership` in standard operators.
 
 Nothing is cached beside a map and no shape depends on values, so that a graph can hold it.
 """
@@ -11,11 +11,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcgs.kernels.antialiasing import antialias, shifted
-from kcgs.kernels.resampled import LEAST_BLUR, sharpness
-from kcgs.maps import RADIUS_SIGMAS
+from kcgs.maps import LEAST_BLUR, RADIUS_SIGMAS, MapOperands, antialias, sharpness, shifted
 
-from .map_tables import MapOperands
 from .sizes import is_equal
 
 _FAR = 1e12  # more than any squared distance

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from kcgs._check import check_number
 from kcgs._labels import check_labels
+from kcgs.maps import compact, contour_edges, unique_pairs
 
 from .contour_fit import check_problem, contour_gain
-from .labels import compact, contour_edges, unique_pairs
 
 Labels = NDArray[np.int64]
 

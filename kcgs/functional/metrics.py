@@ -11,9 +11,9 @@ from torch.nn.functional import avg_pool2d, pad
 from kcgs._check import check_image
 from kcgs._labels import check_labels
 from kcgs._warn import warn_user
+from kcgs.maps import edge_band
 
 from .blur import blur, gaussian_taps
-from .labels import edge_band
 
 # Wang et al. 2004
 SSIM_WINDOW = 11  # pixels

@@ -7,13 +7,12 @@ from torch import Tensor
 
 from kcgs._check import check_cutoff, check_floating, check_ids, check_rows, check_size
 from kcgs.kernels import check_backend
+from kcgs.maps import MapOperands, RegionMap, map_operands
 
 from .arguments import SplatArguments
 from .decomposition import decompose
 from .evaluation import error_gradients
-from .map_tables import MapOperands
 from .operator import splat_operator
-from .regions import RegionMap, map_operands
 from .torch_internals import register_decomposition
 
 # for torch.onnx.export alone: compilers and torch.export keep the operator

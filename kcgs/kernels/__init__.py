@@ -7,17 +7,15 @@ From the name of a backend to its innermost loop: `registry`, then one of four k
 - `cuda`: Triton's programs, which plan, render and gather.
 - `cpu`: its own `lists`, numba's loops, vector code.
 
-All take the inputs of `interface`, with a `membership`, perhaps `resampled`, and share `whitened` coordinates.
+All take the inputs of `interface`, and share `whitened` coordinates.
 `tiled` and `cuda` share `tiles`; `cpu` evaluates wide Gaussians on `coarse_grids`.
 """
 
 from .cuda.capacity import settle, without_waiting
 from .interface import SplatInputs, Steps, with_autograd
-from .membership import Membership
 from .registry import BACKENDS, check_backend, prepare, resolve, takes_triton
-from .resampled import Resampled
 
 __all__ = [
-    "BACKENDS", "Membership", "Resampled", "SplatInputs", "Steps", "check_backend", "prepare", "resolve", "settle",
-    "takes_triton", "with_autograd", "without_waiting",
+    "BACKENDS", "SplatInputs", "Steps", "check_backend", "prepare", "resolve", "settle", "takes_triton",
+    "with_autograd", "without_waiting",
 ]  # fmt: skip

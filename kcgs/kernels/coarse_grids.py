@@ -11,7 +11,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .membership import Membership
+from kcgs.maps import Membership
+
 from .tiles import TILE
 
 # nodes along the longer side of the coarsest grid

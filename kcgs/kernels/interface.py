@@ -9,9 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from kcgs.maps.coverage import Coverage
-
-from .membership import Membership
+from kcgs.maps import Coverage, Membership
 
 Gradients = tuple[Tensor | None, Tensor | None, Tensor]
 

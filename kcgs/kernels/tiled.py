@@ -14,8 +14,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad, threshold
 
+from kcgs.maps import TileMembership
+
 from .interface import Gradients, SplatInputs, Steps, with_autograd
-from .membership import TileMembership
 from .tiles import (
     TILE,
     TileGrid,

@@ -9,9 +9,9 @@ from torch import Tensor, nn
 
 from kcgs._check import check_cutoff, check_size
 from kcgs.functional import RegionMap
-from kcgs.functional.regions import map_operands
 from kcgs.functional.sizes import is_equal
 from kcgs.functional.splat import splat_at
+from kcgs.maps import map_operands
 
 from .field import GaussianField, scaled_gaussians
 

@@ -10,9 +10,8 @@ import torch
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from kcgs.kernels.membership import Membership
 from kcgs.kernels.tiles import TILE
-from kcgs.maps import RADIUS_SIGMAS
+from kcgs.maps import RADIUS_SIGMAS, Membership
 
 from .graph import FLOAT, Graph, Value
 from .groups import Integers
@@ -107,7 +106,7 @@ def _list_parts(tiles: Tiles, ids: Integers, levels: Integers) -> tuple[Integers
 def _kernels(g: Graph, membership: Membership) -> Value:
     """Make the blurs of V widths from the pixels of a label window to those of a window, (V, S, side).
 
-    The taps are those of `kcgs.kernels.membership`, by operators, since a file that stored them would be larger.
+    The taps are those of `kcgs.maps.membership`, by operators, since a file that stored them would be larger.
     """
     widths, radius = np.array(membership.levels.widths), membership.radius
     distance = np.abs(np.arange(WINDOW)[:, None] - np.arange(WINDOW + 2 * radius) + radius).astype(np.float32)

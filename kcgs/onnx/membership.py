@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from kcgs.functional import RegionMap
-from kcgs.kernels.resampled import LEAST_BLUR, PIXEL
+from kcgs.maps import LEAST_BLUR, PIXEL
 
 from .axis import Axis, Interpolator
 from .blur import BlurredWindows, cut_windows
@@ -49,7 +49,7 @@ def make_membership(storage: Storage, regions: RegionMap, down: Axis, across: Ax
 
 
 class MembershipSampler:
-    """Samples the memberships in the blocks of tiles with several regions, as :class:`kcgs.kernels.Resampled` has it.
+    """Samples the memberships in the blocks of tiles with several regions, as :class:`kcgs.maps.Resampled` has it.
 
     Args:
         g: the graph.
@@ -92,7 +92,7 @@ class MembershipSampler:
 
 
 def _sharpness(g: Graph, variance: Value, ratio: Value) -> Value:
-    """Evaluate `kcgs.kernels.resampled.sharpness` by operators, since the ratio is known only when the graph runs."""
+    """Evaluate `kcgs.maps.sharpness` by operators, since the ratio is known only when the graph runs."""
     width = g.Max(variance - PIXEL, 0.0) * ratio + PIXEL
     return g.Sqrt((g.Max(variance, LEAST_BLUR**2) + PIXEL) * ratio / width)
 

@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from kcgs.functional import RegionMap
-from kcgs.kernels.membership import Membership
-from kcgs.kernels.resampled import SmoothMembership
 from kcgs.kernels.tiles import TILE
+from kcgs.maps import Membership, SmoothMembership
 
 # side of a window: a tile and the pixels around it, those of the border of the scene repeated beyond it
 WINDOW = TILE + 2

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import torch
 
-from kcgs.kernels import Membership
+from kcgs.maps import Membership
 
 from .graph import FLOAT, Graph, Value
 from .groups import Integers

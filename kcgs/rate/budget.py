@@ -24,8 +24,8 @@ from kcgs.fitting.objective import make_objective
 from kcgs.fitting.problem import Problem, make_problem
 from kcgs.fitting.region_report import report_regions
 from kcgs.functional import RegionMap, edge_band, merge_regions
-from kcgs.functional.labels import contour_edges
 from kcgs.functional.merging import pairs_to_merge
+from kcgs.maps import contour_edges
 from kcgs.nn import GaussianField
 from kcgs.nn.field import scaled_gaussians
 from kcgs.nn.renderer import area_mean

@@ -15,7 +15,7 @@ import torch
 from kcgs import GaussianField, RegionMap, Scene, codec, load
 from kcgs.codec import encode
 from kcgs.codec.file import unpack
-from kcgs.functional.labels import touching_pairs
+from kcgs.maps import touching_pairs
 
 from ..codec.damage import damaged, damaged_inside
 from .browser import WEB, Browser, check_npm, compile_decoder, serving

@@ -8,9 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcgs.kernels import Membership, SplatInputs, reference
+from kcgs.kernels import SplatInputs, reference
 from kcgs.kernels.coarse_grids import choose_levels, coarsen, grids_of, max_spacing
 from kcgs.kernels.cpu import kernel as cpu
+from kcgs.maps import Membership
 
 CUTOFF = 1e-4
 

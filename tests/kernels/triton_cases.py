@@ -14,8 +14,9 @@ from torch import Tensor
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer
 from kcgs.functional import region_splat
 from kcgs.functional.operator import splat_operator
-from kcgs.kernels import Membership, SplatInputs, cuda, reference, settle, without_waiting
+from kcgs.kernels import SplatInputs, cuda, reference, settle, without_waiting
 from kcgs.kernels.cuda import capacity, gather, plan, program, render
+from kcgs.maps import Membership
 from kcgs.optim import GaussianAdam
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")

@@ -11,9 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcgs.functional.labels import compact
-from kcgs.kernels import Membership, Resampled
-from kcgs.maps import ContourWidths, Coverage, find_widths, make_coverage
+from kcgs.maps import ContourWidths, Coverage, Membership, Resampled, compact, find_widths, make_coverage
 
 TILE = 16
 Widths = float | dict[tuple[int, int], float]

@@ -15,7 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from kcgs import GaussianField, RegionMap, Scene
 from kcgs.functional import region_splat
 from kcgs.functional.decomposition import decompose
-from kcgs.functional.regions import map_operands
+from kcgs.maps import map_operands
 
 SIZE = (40, 56)
 PAIRS = {(0, 3): 1.1, (0, 7): 0.0, (3, 7): 2.0}

@@ -20,7 +20,7 @@ from torch.utils.checkpoint import checkpoint
 
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
 from kcgs.functional import lookup_regions, region_splat
-from kcgs.functional.regions import map_operands
+from kcgs.maps import map_operands
 
 SIZE = (24, 32)
 
@@ -320,7 +320,7 @@ class TestOperator:
     ) -> None:
         compiled = torch.compile(RegionSplatRenderer(), backend="aot_eager")
         before = compiled(field, regions)
-        monkeypatch.setattr("kcgs.functional.map_tables.make_tables", None)
+        monkeypatch.setattr("kcgs.maps.map_tables.make_tables", None)
         assert torch.equal(compiled(field, regions), before)
 
     def test_a_pickle_has_no_tables_of_other_sizes(self, field: GaussianField, regions: RegionMap) -> None:

@@ -1,4 +1,4 @@
-/** Antialiased labels: a smooth curve through a contour cuts the pixels beside it. As kcgs/kernels/antialiasing.py. */
+/** Antialiased labels: a smooth curve through a contour cuts the pixels beside it. As kcgs/maps/antialiasing.py. */
 
 /** What each pixel is of: its own label, and that of one neighbour. */
 export interface SmoothLabels {

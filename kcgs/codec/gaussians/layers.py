@@ -16,7 +16,7 @@ from kcgs.codec.adaptive import AdaptiveAngle, AdaptiveMagnitude, AdaptiveNumber
 from kcgs.codec.exact import Floats, Integers, exp2
 from kcgs.codec.rangecoder import CodecError, Coder, Reader, Writer
 from kcgs.functional import RegionMap
-from kcgs.functional.labels import pixels_under
+from kcgs.maps import pixels_under
 
 from .occupancy import COUNT_BITS, OccupancyCoder
 from .quantize import ENERGIES, MAX_RATIO, OCTAVES, SIZES, Classes, Codes, Parameters, Quantizer

@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from kcgs.compiled.tasks import chunks, phases, run_tasks
+from kcgs.maps import Membership
 
 from ..coarse_grids import blocks_of, max_spacing
 from ..interface import Gradients, SplatInputs, Steps
-from ..membership import Membership
 from ..whitened import least_exponent, support_radius
 from .gradients import Backward
 from .layout import AHEAD, COLUMNS, SHAPE_COLUMNS, TILE_COLS, TILE_ROWS, VISIT_COLUMNS, Batch, Lists, Table

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_number
-from kcgs.kernels.resampled import contour_variance
-from kcgs.maps import RADIUS_SIGMAS
+
+from .resampled import contour_variance
+from .widths import RADIUS_SIGMAS
 
 MAX_SOFTNESS = 64.0  # pixels: a wider blur is no contour
 _PRINTED_PAIRS = 4  # of a repr

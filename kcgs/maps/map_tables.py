@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 
 from kcgs._labels import check_labels
-from kcgs.kernels import Membership, Resampled
 
 from .labels import compact, sample_labels
+from .membership import Membership
+from .resampled import Resampled
 from .softness import PairSoftness, check_softness, scaled_softness, softness_of
 
 _CACHED_VIEWS = 3  # of a map: a viewer renders at ever new sizes

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcgs.maps import RADIUS_SIGMAS, TILE, Coverage, find_widths, make_coverage
-
 from .antialiasing import SmoothLabels
+from .coverage import TILE, Coverage, make_coverage
+from .widths import RADIUS_SIGMAS, find_widths
 
 T = TypeVar("T")
 

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from kcgs.maps.nearest import spread
 from scipy import ndimage
 from torch import Tensor
 
 from kcgs import RegionMap
 from kcgs.functional import region_splat
-from kcgs.kernels.membership import Membership
-from kcgs.kernels.nearest import spread
 from kcgs.kernels.tiles import TILE
+from kcgs.maps import Membership
 
 Widths = float | dict[tuple[int, int], float]
 PAIRS: dict[tuple[int, int], float] = {(0, 1): 0.7, (1, 2): 2.0, (0, 3): 1.1, (2, 3): 0.7}

@@ -10,9 +10,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcgs.maps import TILE, Coverage
-
 from .antialiasing import SmoothLabels, antialias
+from .coverage import TILE, Coverage
 from .membership import Levels, Membership, TileMembership
 
 # pixels of windows and tiles that are evaluated at once: 16 MiB in float64
