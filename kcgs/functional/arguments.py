@@ -20,7 +20,13 @@ class SplatArguments(NamedTuple):
     colors: Tensor  # [B, N, C]
     region_ids: Tensor | None  # [B, N] int64
     labels: Tensor | None  # [H, W] or [B, H, W] int64, of the map at its own size
-    softness: Tensor | None  # as in `MapOperands`
+    blurs: Tensor | None  # this and the next six: see `MapOperands`
+    width_index: Tensor | None
+    ids: Tensor | None
+    starts: Tensor | None
+    regions: Tensor | None
+    planes: Tensor | None
+    weights: Tensor | None
     height: int
     width: int
     cutoff: float
@@ -34,4 +40,4 @@ class SplatArguments(NamedTuple):
     @property
     def map_operands(self) -> MapOperands | None:
         """The map at the size of the image; None: one region covers everything."""
-        return None if self.labels is None else MapOperands(self.labels, self.softness, self.size)
+        return None if self.labels is None else MapOperands(self.labels, *self[5:12], self.size)

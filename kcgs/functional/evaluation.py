@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from kcgs.kernels import SplatInputs, Steps, resolve, with_autograd
-from kcgs.maps import tables_at
+from kcgs.maps import membership_at, positions_of
 
 from .arguments import SplatArguments
 from .values import check_region_ids, check_values
@@ -33,7 +33,7 @@ def plan_splat(arguments: SplatArguments, check: bool = True) -> Plan:
     if content is None:
         check_values(*arguments[:3])
     if steps.looks_up_regions and (content is None or (check and content.foreign)):
-        _look_up(inputs, arguments, True)
+        _look_up(inputs, True)
     return Plan(steps, inputs, content)
 
 
@@ -107,27 +107,27 @@ def _prepare(arguments: SplatArguments, check: bool) -> tuple[SplatInputs, Steps
     """Return the inputs of the kernel, and the kernel."""
     ids = regions = membership = None
     if arguments.map_operands is not None and arguments.region_ids is not None:
-        tables, regions = tables_at(arguments.map_operands), arguments.region_ids.contiguous()
-        ids, membership = tables.ids, tables.membership
+        membership, regions = membership_at(arguments.map_operands), arguments.region_ids.contiguous()
+        ids = membership.ids
     inputs = SplatInputs(*arguments[:3], regions, membership, arguments.size, arguments.cutoff, ids)
     steps = resolve(arguments.backend, inputs)
     if not steps.looks_up_regions:
-        inputs = _look_up(inputs, arguments, check)
+        inputs = _look_up(inputs, check)
     if check and not steps.checks_inputs:
         check_values(*arguments[:3])
     return inputs if steps.checks_inputs else inputs.with_batch(), steps
 
 
-def _look_up(inputs: SplatInputs, arguments: SplatArguments, check: bool) -> SplatInputs:
+def _look_up(inputs: SplatInputs, check: bool) -> SplatInputs:
     """Put the positions of regions in place of their ids."""
-    if arguments.map_operands is None or inputs.region_index is None:
+    if inputs.ids is None or inputs.region_index is None:
         return inputs
-    tables, region_ids = tables_at(arguments.map_operands), torch.atleast_2d(inputs.region_index)
-    index = tables.index_of(region_ids)
+    region_ids = torch.atleast_2d(inputs.region_index)
+    index = positions_of(region_ids, inputs.ids)
     known = index.device.type == "cpu" and int(index.numpy().min(initial=0)) >= 0
     if check and not known:
         check_region_ids(region_ids, index)
     # one region covers everything: no map, but Gaussians of other ids still paint nothing
-    if tables.membership.num_regions == 1 and known:
+    if len(inputs.ids) == 1 and known:
         return inputs._replace(region_index=None, membership=None, ids=None)
     return inputs._replace(region_index=index, ids=None)

@@ -11,11 +11,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from kcgs.maps import LEAST_BLUR, RADIUS_SIGMAS, MapOperands, antialias, sharpness, shifted
+from kcgs.maps import LEAST_BLUR, RADIUS_SIGMAS, MapOperands, antialias, sharpness
 
 from .sizes import is_equal
 
-_FAR = 1e12  # more than any squared distance
 _TINY = 1e-30  # less than any sum of a blur
 _LARGEST_EXPONENT = 64  # of memberships: float32 holds the powers
 
@@ -28,44 +27,40 @@ class MapWindows:
 
     def __init__(self, regions: MapOperands, side: int, dtype: torch.dtype) -> None:
         """Prepare tiles of `side` pixels; memberships are computed in `dtype`."""
-        labels, softness, size = regions
+        labels, size = regions.labels, regions.size
         device = labels.device
         self.side, self.dtype = side, dtype
         self.is_resized = not all(is_equal(new, old) for new, old in zip(size, labels.shape[-2:], strict=True))
-        self.soft = softness is not None or self.is_resized
-        self.pairs = softness is not None and softness.ndim == 2
-        taps = 1 if softness is None else softness.shape[-1] - (3 if self.pairs else 1)
+        self.soft = regions.blurs is not None or self.is_resized
+        self.has_widths = regions.width_index is not None
+        taps = 1 if regions.blurs is None else regions.blurs.shape[1] - 1
         least = math.ceil(RADIUS_SIGMAS * LEAST_BLUR) if self.is_resized else 0
         self.reach = max(taps - 1, least)
         # distance at which a region around a pixel may be a part of it: antialiasing reaches one pixel farther
         self.margin = self.reach + self.is_resized
-        # the nearest contour of a pixel of several regions is no farther away than this
-        self.search = math.ceil(math.sqrt(2) * self.margin)
-        self.halo = self.search if self.pairs else self.margin
         down, across = (self._axis(size[k], labels.shape[k - 2], device) for k in (0, 1))
         self._tables_per_axis = len(down)
         maps = labels if labels.ndim == 3 else labels[None]
         numbers = torch.stack([torch.full((), n, dtype=torch.int64, device=device) for n in maps.shape])
-        images, self._widths = self._soft_tables(maps, softness, size) if self.soft else ((), ())
+        images, self._widths = self._soft_tables(maps, regions) if self.soft else ((), ())
         self.tables = (numbers, *down, *across, *(image.flatten() for image in (maps, *images)), *self._widths)
 
-    def _soft_tables(
-        self, maps: Tensor, softness: Tensor | None, size: Sequence[int]
-    ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+    def _soft_tables(self, maps: Tensor, regions: MapOperands) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
         """Return what is read of pixels beside their labels; and widths of contours, their blurs, and the ratio."""
-        widths = torch.zeros(1, dtype=torch.float64, device=maps.device) if softness is None else softness[:1]
-        levels = torch.zeros_like(maps)
-        if softness is not None and self.pairs:
-            # a contour between regions that `softness` does not name is hard: one row beyond the last
-            widths = torch.nn.functional.pad(softness[:, 2], (0, 1))
-            levels = _touching_levels(maps, softness[:, :2].long())
-        images: tuple[Tensor, ...] = (levels,) if self.pairs else ()
+        widths = torch.zeros(1, dtype=torch.float64, device=maps.device)
+        width_index = torch.zeros_like(maps)
+        if regions.blurs is not None:
+            widths = regions.blurs[:, 0]
+        images: tuple[Tensor, ...] = ()
+        if regions.width_index is not None:
+            width_index = regions.width_index.long()
+            images = (width_index,)
         blurs = widths
-        sides = [torch.full((), n, dtype=torch.float64, device=maps.device) for n in (*maps.shape[-2:], *size)]
+        sides = [torch.full((), n, dtype=torch.float64, device=maps.device) for n in (*maps.shape[-2:], *regions.size)]
         ratio = torch.stack([sides[2] / sides[0], sides[3] / sides[1]])
         if self.is_resized:
             is_native = (ratio == 1).all()  # which a graph of any size may be
-            is_sharp = widths.index_select(0, levels.clamp_min(0).flatten()).reshape(levels.shape) < LEAST_BLUR
+            is_sharp = widths.index_select(0, width_index.flatten()).reshape(maps.shape) < LEAST_BLUR
             weight, other, other_weight = antialias(maps, is_sharp)
             blurs = torch.where(is_native, widths, widths.clamp_min(LEAST_BLUR))
             weight, other_weight = torch.where(is_native, 1.0, weight), torch.where(is_native, 0.0, other_weight)
@@ -94,7 +89,7 @@ class MapWindows:
 
     def _lines(self, first: Tensor, span: int, length: int) -> tuple[Tensor, Tensor]:
         """Return the rows or columns of windows of `span` pixels with a halo, clamped, and which are in the image."""
-        lines = torch.arange(span + 2 * self.halo, device=first.device) - self.halo
+        lines = torch.arange(span + 2 * self.margin, device=first.device) - self.margin
         lines = first[:, None] + lines
         return lines.clamp(0, length - 1), ((lines >= 0) & (lines < length)).to(self.dtype)
 
@@ -117,27 +112,20 @@ class MapWindows:
             table.index_select(0, places.flatten()).reshape(places.shape)
             for table in tables[end : len(tables) - len(self._widths)]
         )
-        # pixels beyond the reach of a blur say which contour is near, but are of no region here
-        ids = self._crop(window, self.halo - self.margin).flatten().sort()[0]
+        ids = window.flatten().sort()[0]
         if not self.soft:
             return ids, window
         variances, taps, ratio = tables[-len(self._widths) :]
-        level = torch.zeros_like(ids[:1])
-        if self.pairs:
-            # where there is one region, any blur is right
-            level = torch.ops.higher_order.cond(
-                ids[0] != ids[-1],
-                lambda *operands: self._nearest_levels(*operands),
-                lambda *operands: self._no_levels(*operands),
-                (images.pop(0), down[1], across[1]),
-            )[0]
+        width = torch.zeros_like(ids[:1])
+        if self.has_widths:
+            width = self._crop(images.pop(0), self.margin).flatten()
         mirrored = torch.arange(-self.reach, self.reach + 1, device=window.device).abs()
-        blurs = taps.to(self.dtype).index_select(0, level).index_select(1, mirrored)
+        blurs = taps.to(self.dtype).index_select(0, width).index_select(1, mirrored)
         operands = (window, down[1], across[1], blurs)
         if not self.is_resized:
             return ids, *operands
-        sides = [n - 2 * self.halo for n in window.shape]
-        variance = variances.to(self.dtype).index_select(0, level).expand(sides[0] * sides[1]).reshape(sides)
+        sides = [n - 2 * self.margin for n in window.shape]
+        variance = variances.to(self.dtype).index_select(0, width).expand(sides[0] * sides[1]).reshape(sides)
         exponent = sharpness(down[2] @ variance @ across[2].T, ratio.prod().to(self.dtype))
         exponent = torch.where((ratio == 1).all(), 1.0, exponent.clamp_max(_LARGEST_EXPONENT))
         return ids, *operands, *images, down[2], across[2], exponent
@@ -155,7 +143,7 @@ class MapWindows:
         if interpolation:
             weight, other, other_weight, rows, columns, exponent = interpolation
             inside = inside * weight + (other == region).to(self.dtype) * other_weight
-        margin = self.halo - self.reach
+        margin = self.margin - self.reach
         down, across = (t[margin : t.shape[0] - margin] for t in (rows_inside, columns_inside))
         membership = self._blur(self._crop(inside, margin) * down[:, None] * across, blurs, down, across)
         return (rows @ membership @ columns.T).clamp_min(0) ** exponent if interpolation else membership
@@ -178,52 +166,3 @@ class MapWindows:
         blurred = kernels.permute(1, 0, 2) @ blurred  # [width, height, height + 2 R]
         blurred = blurred.gather(2, rows.reshape(1, height, taps).expand(width, height, taps))
         return (blurred * kernels.permute(1, 0, 2)).sum(-1).T / total.clamp_min(_TINY)
-
-    def _no_levels(self, levels: Tensor, *_: Tensor) -> tuple[Tensor]:
-        return (torch.zeros_like(self._crop(levels, self.halo).flatten()),)
-
-    def _nearest_levels(self, levels: Tensor, rows_inside: Tensor, columns_inside: Tensor) -> tuple[Tensor]:
-        """Return for each pixel inside of the halo the level of its nearest contour."""
-        touches = (levels >= 0) & (rows_inside[:, None] * columns_inside > 0)
-        return (self._nearest(touches, levels).flatten().clamp_min(0),)
-
-    def _nearest(self, touches: Tensor, level: Tensor) -> Tensor:
-        """Give each pixel inside of a halo of `search` the level of the nearest that touches a contour.
-
-        Of several the leftmost, then the topmost, as scipy's distance transform has it.
-        """
-        taps = 2 * self.search + 1
-        height, width = (n - taps + 1 for n in touches.shape)
-        steps = torch.arange(taps, device=touches.device)
-        squares = ((steps - self.search) ** 2).to(self.dtype)
-        rows, columns = (torch.arange(n, device=touches.device)[:, None] + steps for n in (height, width))
-        near = touches.index_select(0, rows.flatten()).reshape(height, taps, -1)
-        square, step = torch.where(near, squares[:, None], _FAR).min(1)
-        level = level.gather(0, step + rows[:, :1])  # [height, width + halo]
-        square = square.T.index_select(0, columns.flatten()).reshape(width, taps, height) + squares[:, None]
-        return level.gather(1, square.argmin(1).T + columns[:, 0])
-
-
-def _touching_levels(labels: Tensor, pairs: Tensor) -> Tensor:
-    """Return the row of sorted pairs, (P, 2), that each pixel which touches a contour has, P if none; -1 for others."""
-    other = labels
-    # the first of these that differs, so the last comes first
-    for down, right in ((1, 0), (0, 1), (0, -1), (-1, 0)):
-        neighbour = shifted(labels, down, right)
-        other = torch.where(neighbour != labels, neighbour, other)
-    low, high = torch.minimum(labels, other).flatten(), torch.maximum(labels, other).flatten()
-    return torch.where(other != labels, _search_pairs(pairs, low, high).reshape(labels.shape), -1)
-
-
-def _search_pairs(pairs: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Return the row of sorted pairs, (P, 2), that is (low, high), by a binary search; P where there is none."""
-    count = pairs.shape[0]
-    first, second = pairs.unbind(1)
-    begin, end = torch.zeros_like(low), torch.full_like(low, count)
-    for _ in range(count.bit_length()):
-        middle = (begin + end) // 2
-        a, b = (ids.index_select(0, middle.clamp_max(count - 1)) for ids in (first, second))
-        below = ((a < low) | ((a == low) & (b < high))) & (middle < end)
-        begin, end = torch.where(below, middle + 1, begin), torch.where(below, end, middle)
-    a, b = (ids.index_select(0, begin.clamp_max(count - 1)) for ids in (first, second))
-    return torch.where((a == low) & (b == high), begin, count)

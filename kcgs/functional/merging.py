@@ -86,7 +86,7 @@ def pairs_to_merge(image: Tensor, labels: Tensor, max_regions: int) -> list[tupl
         >>> pairs_to_merge(torch.tensor([[[0.0, 0.1, 0.9, 0.9]]]), labels, 2)
         [(5, 4)]
     """
-    ids, index, _ = compact(labels.cpu())
+    ids, index = compact(labels.cpu())
     graph = RegionGraph(index.numpy().astype(np.int64))
     flat = index.flatten().numpy()
     colors = image.detach().cpu().double().flatten(1).numpy()

@@ -27,9 +27,12 @@ from .torch_internals import (
 )
 
 _ARGUMENTS = (
-    "Tensor means, Tensor cholesky, Tensor colors, Tensor? region_ids, Tensor? labels, Tensor? softness, "
+    "Tensor means, Tensor cholesky, Tensor colors, Tensor? region_ids, Tensor? labels, Tensor? blurs, "
+    "Tensor? width_index, Tensor? ids, Tensor? starts, Tensor? regions, Tensor? planes, Tensor? weights, "
     "SymInt height, SymInt width, float cutoff, str backend"
 )
+# of these, those that are not differentiated by
+_NUM_CONSTANTS = len(SplatArguments._fields) - 3
 _BACKWARD = f"Tensor grad, {_ARGUMENTS}, bool geometry"
 _TANGENTS = "Tensor d_means, Tensor d_cholesky, Tensor d_colors"
 _LIBRARY = torch.library.Library("kcgs", "DEF")
@@ -88,7 +91,7 @@ class _Splat(torch.autograd.Function):
         if not is_graph_retained():
             ctx.plan = None  # as torch frees what is saved: a loss that stays alive holds no plan
         needed = zip(gradients, (means, cholesky, colors), strict=True)
-        return (*(g if need else None for g, need in needed), *[None] * 7)
+        return (*(g if need else None for g, need in needed), *[None] * _NUM_CONSTANTS)
 
 
 class _SplatBackward(torch.autograd.Function):
@@ -112,7 +115,7 @@ class _SplatBackward(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         second = _double_backward_operator(*grads, *ctx.saved_tensors, *ctx.constants)
         needed = zip(second, ctx.needs_input_grad[:4], strict=True)
-        return (*(g if need else None for g, need in needed), *[None] * 8)
+        return (*(g if need else None for g, need in needed), *[None] * (_NUM_CONSTANTS + 1))
 
 
 class _SplatForward(torch.autograd.Function):
@@ -133,7 +136,7 @@ class _SplatForward(torch.autograd.Function):
         constants = _constants(ctx)
         first = _backward_operator(grad, *gaussians, *constants, True)
         second = _double_backward_operator(*tangents, grad, *gaussians, *constants, True)[1:]
-        return (*first, *second, *[None] * 7)
+        return (*first, *second, *[None] * _NUM_CONSTANTS)
 
 
 class _SplatDoubleBackward(torch.autograd.Function):
@@ -264,14 +267,17 @@ def _backward_vmap(
     return tuple(g.unflatten(0, (info.batch_size, -1)) if batched else g for g in gradients), (0, 0, 0)
 
 
+_MAP_FIELDS = ("labels", "width_index", "ids", "height")
+
+
 def _fold(info: Any, in_dims: tuple[int | None, ...], arguments: tuple[Any, ...], means: int) -> tuple[bool, list[Any]]:
     """Put the mapped dimension of every tensor into its batch; `means` is the place of that argument.
 
     Returns, first, whether there was a batch.
     """
-    labels, softness = means + 4, means + 5
-    if in_dims[softness] is not None:
-        raise ValueError("softness cannot be mapped over: give the images as a batch")
+    labels, width_index, ids, sizes = (means + SplatArguments._fields.index(n) for n in _MAP_FIELDS)
+    if any(in_dims[k] is not None for k in range(labels + 1, sizes)):
+        raise ValueError("a RegionMap cannot be mapped over: give the images as a batch")
 
     def mapped(k: int) -> Tensor:
         tensor, dim = arguments[k], in_dims[k]
@@ -286,9 +292,16 @@ def _fold(info: Any, in_dims: tuple[int | None, ...], arguments: tuple[Any, ...]
     maps = arguments[labels]
     # a map that all images share stays as it is
     if maps is not None and (in_dims[labels] is not None or (maps.ndim == 3 and maps.shape[0] > 1)):
-        maps = mapped(labels)
-        maps = maps[:, None] if maps.ndim == 3 else maps
-        folded[labels] = maps.expand(-1, mapped(means).shape[1] if batched else 1, -1, -1).flatten(0, 1)
+        count = mapped(means).shape[1] if batched else 1
+
+        def each(k: int) -> Tensor:
+            part = mapped(k)
+            part = part[:, None] if part.ndim == 3 else part
+            return part.expand(-1, count, -1, -1).flatten(0, 1)
+
+        for k in (labels, width_index):
+            folded[k] = None if arguments[k] is None else each(k)
+        folded[ids:sizes] = [None] * (sizes - ids)  # they number the maps otherwise
     return batched, folded
 
 

@@ -18,6 +18,8 @@ from .torch_internals import register_decomposition
 # for torch.onnx.export alone: compilers and torch.export keep the operator
 register_decomposition(splat_operator, decompose)
 
+_NO_MAP = (None,) * (len(MapOperands._fields) - 1)
+
 
 def region_splat(
     means: Tensor,
@@ -101,15 +103,15 @@ def splat_at(
 ) -> Tensor:
     """Render at a size, at which the map is sampled, as by :meth:`RegionMap.resize`; ids and map come together."""
     _check_gaussians(means, cholesky, colors)
-    labels = softness = None
+    tensors: tuple[Tensor | None, ...] = _NO_MAP
     if regions is not None:
-        region_ids, labels = check_ids("region_ids", region_ids, means, values=False), regions.labels
-        _check_map(labels, means)
-        softness = regions.softness
+        region_ids = check_ids("region_ids", region_ids, means, values=False)
+        _check_map(regions.labels, means)
+        tensors = regions[:-1]
     dtype = torch.float64 if torch.float64 in (means.dtype, cholesky.dtype, colors.dtype) else torch.float32
     gaussians = [t if t.dtype == dtype else t.to(dtype) for t in (means, cholesky, colors)]
     image: Tensor = splat_operator(
-        *gaussians, region_ids, labels, softness, *size, check_cutoff(cutoff), check_backend(backend)
+        *gaussians, region_ids, *tensors, *size, check_cutoff(cutoff), check_backend(backend)
     )
     return image if colors.dtype == dtype else image.to(colors.dtype)
 
@@ -130,11 +132,10 @@ def squared_error_gradients(
     For descents: one pass over the image where the backend has it, no graph, and arguments are not checked.
     """
     height, width = image.shape[1:]
-    operands = None if regions is None else map_operands(regions)
-    labels, softness = (None, None) if operands is None else operands[:2]
+    tensors = _NO_MAP if regions is None else map_operands(regions)[:-1]
     gaussians = means.detach(), cholesky.detach(), colors.detach()
-    arguments = SplatArguments(*gaussians, region_ids, labels, softness, height, width, cutoff, backend)
-    return error_gradients(arguments, image)
+    arguments = *gaussians, region_ids, *tensors, height, width, cutoff, backend
+    return error_gradients(SplatArguments._make(arguments), image)
 
 
 def _check_gaussians(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:

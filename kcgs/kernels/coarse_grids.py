@@ -6,12 +6,11 @@ the pixels. `cpu` and the ONNX decoders use it; docs/performance.md has the form
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
-
-from kcgs.maps import Membership
 
 from .tiles import TILE
 
@@ -35,30 +34,28 @@ class Grid(NamedTuple):
 
 
 class Blocks(NamedTuple):
-    """Tile and region of every block, all levels, and the blocks of the next level that each is refined from."""
+    """Region of every block, all levels, and the blocks of the next level that each is refined from."""
 
     grids: tuple[Grid, ...]
-    keys: Tensor  # [K] int64, sorted: tile * num_regions + region
-    parents: Tensor  # [K, 4] int64 into keys: above left, above right, below left, below right; K: none
-    parity: Tensor  # [K] uint8: 1 in an odd column of tiles, 2 in an odd row, 3 both
-    starts: tuple[int, ...]  # first block of each level, and the end
+    starts: Any  # [tiles + 1] int64, first block of each tile, all levels
+    regions: Any  # [K] int64, ascending within a tile
+    parents: Any  # [K, 4] int64, above left, above right, below left, below right; K: none
+    parity: Any  # [K] uint8: 1 in an odd column of tiles, 2 in an odd row, 3 both
 
     @property
-    def first(self) -> int:
-        """First block of level 1 or above; those before are tiles of pixels."""
-        return self.starts[1]
+    def levels(self) -> list[int]:
+        """First block of each level, and the end."""
+        return [*(int(self.starts[grid.first_tile]) for grid in self.grids), len(self.regions)]
+
+    @property
+    def tiles(self) -> Any:
+        """The tile of each block, [K]."""
+        return np.repeat(np.arange(len(self.starts) - 1), np.diff(self.starts))
 
 
 def max_spacing(cutoff: float) -> float:
     """Return the largest spacing of nodes that a Gaussian allows, in its smaller standard deviations; 0: none."""
     return min(_SPACING * float(cutoff**0.25), _MAX_SPACING)
-
-
-def blocks_of(membership: Membership | None, size: tuple[int, int]) -> Blocks:
-    """Return the blocks of a map, or of one region everywhere."""
-    if membership is None:
-        return make_blocks(torch.arange(-(-size[0] // TILE) * -(-size[1] // TILE)), 1, (1, *size))
-    return make_blocks(membership.tiles(TILE).keys, membership.num_regions, membership.index.shape)
 
 
 def grids_of(size: tuple[int, int], maps: int) -> tuple[Grid, ...]:
@@ -75,43 +72,13 @@ def grids_of(size: tuple[int, int], maps: int) -> tuple[Grid, ...]:
     return tuple(grids)
 
 
-def make_blocks(keys: Tensor, num_regions: int, shape: tuple[int, ...]) -> Blocks:
-    """Return the blocks of all levels for those of pixels: keys, sorted, of maps of a shape (maps, height, width)."""
+def make_blocks(starts: Any, regions: Any, num_regions: int, shape: tuple[int, ...]) -> Blocks:
+    """Return the blocks of all levels for the regions of tiles, as of `Coverage`, of maps of a shape (maps, H, W)."""
+    from .blocks import refine  # loads numba
+
     maps, *size = shape
     grids = grids_of((size[0], size[1]), maps)
-    levels, parents, parities, starts = [keys], [], [], [0, len(keys)]
-    for grid, coarser in zip(grids, (*grids[1:], None), strict=True):
-        row, col = _places(keys, num_regions, grid)[1:3]
-        parities.append(2 * (row % 2) + col % 2)
-        if coarser is None:
-            break
-        parent_keys = _parent_keys(keys, num_regions, grid, coarser)
-        keys = parent_keys[parent_keys >= 0].unique()
-        parents.append(torch.where(parent_keys < 0, -1, torch.searchsorted(keys, parent_keys) + starts[-1]))
-        levels.append(keys)
-        starts.append(starts[-1] + len(keys))
-    parents.append(keys.new_full((len(keys), 4), -1))
-    table = torch.cat(parents)
-    table[table < 0] = starts[-1]
-    return Blocks(grids, torch.cat(levels), table, torch.cat(parities).to(torch.uint8), tuple(starts))
-
-
-def _places(keys: Tensor, num_regions: int, grid: Grid) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return map, row, column and region of blocks."""
-    tile = keys // num_regions - grid.first_tile
-    return tile // (grid.cols * grid.rows), tile // grid.cols % grid.rows, tile % grid.cols, keys % num_regions
-
-
-def _parent_keys(keys: Tensor, num_regions: int, fine: Grid, coarse: Grid) -> Tensor:
-    """Return the keys of the four blocks that each block reads of the coarser grid, -1 where it does not, (K, 4)."""
-    map_index, row, col, region = _places(keys, num_regions, fine)
-    parents = []
-    for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        y, x = (row + down) // 2, (col + right) // 2
-        is_read = (y < coarse.rows) & (x < coarse.cols) & (row % 2 >= down) & (col % 2 >= right)
-        parent = coarse.first_tile + (map_index * coarse.rows + y) * coarse.cols + x
-        parents.append(torch.where(is_read, parent * num_regions + region, -1))
-    return torch.stack(parents, -1)
+    return Blocks(grids, *refine(starts.astype(np.int64), regions.astype(np.int64), num_regions, maps, np.array(grids)))
 
 
 class Coarsened(NamedTuple):

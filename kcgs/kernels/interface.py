@@ -32,7 +32,7 @@ class SplatInputs(NamedTuple):
     @property
     def coverage(self) -> Coverage | None:
         """The map's table of tiles."""
-        return None if self.membership is None else self.membership.coverage()
+        return None if self.membership is None else self.membership.coverage
 
     @property
     def gaussians(self) -> tuple[Tensor, Tensor, Tensor]:

@@ -62,7 +62,7 @@ def _regions(inputs: SplatInputs, b: int) -> Iterator[tuple[Tensor, Tensor | Non
     if membership is None or index is None:
         yield torch.arange(inputs.means.shape[1], device=inputs.means.device), None
         return
-    map_index = b if membership.index.shape[0] > 1 else 0
+    map_index = b if membership.labels.shape[0] > 1 else 0
     for region in range(membership.num_regions):
         members = (index[b] == region).nonzero().flatten()
         if len(members):

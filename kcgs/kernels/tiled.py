@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad, threshold
 
-from kcgs.maps import TileMembership
+from kcgs.maps import Coverage
 
 from .interface import Gradients, SplatInputs, Steps, with_autograd
 from .tiles import (
@@ -48,7 +48,7 @@ class _Plan(NamedTuple):
     coefficients: Tensor  # [P, 5], in the dtype of the inputs: see tiles.coefficients
     pieces: Tensor  # [S, _PIECE] int64 into the pairs, padded with -1
     tile: Tensor  # [S] int64, ascending
-    mask_rows: Tensor  # [S] int64 into masks
+    mask_rows: Tensor  # [S] int32 into masks
     masks: Tensor  # [K + 1, 256], in the dtype of the inputs; the last, of ones, is -1
 
 
@@ -68,8 +68,8 @@ def steps(inputs: SplatInputs) -> Steps:
 
 
 def _make_plan(inputs: SplatInputs) -> _Plan:
-    table, num_regions = _tile_regions(inputs)
-    grid, keys = grid_of(inputs), table.keys
+    coverage, num_regions = _tile_regions(inputs)
+    grid, keys = grid_of(inputs), keys_of(coverage, num_regions)
     gaussian, block, affine = _list_pairs(inputs, grid, keys, num_regions)
     order = torch.argsort(block, stable=True)
     blocks, lengths = torch.unique_consecutive(block[order], return_counts=True)
@@ -80,17 +80,23 @@ def _make_plan(inputs: SplatInputs) -> _Plan:
     image, row = blocks[run] // len(keys), blocks[run] % len(keys)
     tiles = grid.rows * grid.cols
     tile = image * tiles + keys[row] // num_regions % tiles
-    masks = pad(table.masks.to(affine.dtype), (0, 0, 0, 1), value=1.0)
-    return _Plan(gaussian, affine, pieces, tile, table.mask_rows[row], masks)
+    masks = pad(coverage.weights.to(affine.dtype), (0, 0, 0, 1), value=1.0)
+    return _Plan(gaussian, affine, pieces, tile, coverage.planes[row], masks)
 
 
-def _tile_regions(inputs: SplatInputs) -> tuple[TileMembership, int]:
+def _tile_regions(inputs: SplatInputs) -> tuple[Coverage, int]:
     """Return the regions of tiles, and the number of regions; without a map, one is everywhere."""
     if inputs.membership is not None:
-        return inputs.membership.tiles(TILE), inputs.membership.num_regions
+        return inputs.membership.coverage, inputs.membership.num_regions
     grid = grid_of(inputs)
-    keys = torch.arange(grid.rows * grid.cols, device=inputs.means.device)
-    return TileMembership(keys, torch.full_like(keys, -1), inputs.means.new_zeros(0, TILE * TILE)), 1
+    starts = torch.arange(grid.rows * grid.cols + 1, device=inputs.means.device)
+    alone = torch.zeros_like(starts[1:])
+    return Coverage(starts, alone, alone - 1, inputs.means.new_zeros(0, TILE * TILE)), 1
+
+
+def keys_of(coverage: Coverage, num_regions: int) -> Tensor:
+    """Return tile * num_regions + region of each entry, which ascend."""
+    return torch.repeat_interleave(coverage.starts.diff()) * num_regions + coverage.regions
 
 
 def _list_pairs(inputs: SplatInputs, grid: TileGrid, keys: Tensor, num_regions: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -102,7 +108,7 @@ def _list_pairs(inputs: SplatInputs, grid: TileGrid, keys: Tensor, num_regions: 
     radius = support_radius(inputs.cutoff, inputs.means.dtype)
     gaussian, place, origin = bounding_tiles(means, cholesky, radius, inputs.size)
     image, tile = gaussian // inputs.means.shape[1], place[:, 1] * grid.cols + place[:, 0]
-    if inputs.membership is not None and len(inputs.membership.index) > 1:
+    if inputs.membership is not None and len(inputs.membership.labels) > 1:
         tile = image * grid.rows * grid.cols + tile
     region = torch.zeros_like(gaussian) if inputs.region_index is None else inputs.region_index.flatten()[gaussian]
     row, is_present = find_keys(keys, tile, region, num_regions)

@@ -8,13 +8,14 @@ from .labels import (
     edge_band,
     lookup_regions,
     pixels_under,
+    positions_of,
     touching_pairs,
     unique_pairs,
 )
-from .map_tables import MapOperands, tables_at
-from .membership import Membership, TileMembership
+from .membership import Membership
+from .operands import MapOperands, membership_at
 from .regions import RegionMap, as_region_map, map_operands, wrap_labels
-from .resampled import LEAST_BLUR, PIXEL, Resampled, SmoothMembership, sharpness
+from .resampled import LEAST_BLUR, PIXEL, Resampled, SmoothMembership, cut_windows, find_windows, sharpness
 from .softness import MAX_SOFTNESS, PairSoftness
 from .widths import RADIUS_SIGMAS, ContourWidths, find_widths
 
@@ -32,20 +33,22 @@ __all__ = [
     "RegionMap",
     "Resampled",
     "SmoothMembership",
-    "TileMembership",
     "antialias",
     "as_region_map",
     "compact",
     "contour_edges",
+    "cut_windows",
     "edge_band",
     "find_widths",
+    "find_windows",
     "lookup_regions",
     "make_coverage",
     "map_operands",
+    "membership_at",
     "pixels_under",
+    "positions_of",
     "sharpness",
     "shifted",
-    "tables_at",
     "touching_pairs",
     "unique_pairs",
     "wrap_labels",

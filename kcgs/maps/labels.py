@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -161,23 +162,30 @@ def union_find(ids: Iterable[int], pairs: Iterable[tuple[int, int]]) -> Callable
     return find
 
 
-def compact(labels: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Return the sorted ids, each pixel's position among them, and for small ids a table from id + 1 to position.
+def compact(labels: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the sorted ids, and each pixel's position among them, int32; other devices than the CPU wait once."""
+    if labels.device.type == "cpu":
+        from .loops import number_regions  # loads numba
 
-    The table begins and ends with -1, for ids below and beyond it. Other devices than the CPU are waited for once, and
-    have none.
-    """
-    if labels.device.type != "cpu":
+        index = np.empty(labels.shape, np.int32)
+        ids = number_regions(labels.contiguous().numpy().ravel(), _TABLE_IDS, index.ravel())
+        if len(ids):
+            return torch.from_numpy(ids), torch.from_numpy(index)
+        ids = labels.unique_consecutive().unique()  # neither makes an int64 index of the pixels, as an inverse is
+    else:
         ids = labels.unique()
-        return ids, torch.searchsorted(ids, labels.contiguous(), out_int32=True), None
-    if int(labels.max()) < _TABLE_IDS:
-        present = torch.bincount(labels.unique_consecutive()) > 0
-        ids = present.nonzero().flatten()
-        table = torch.where(present, present.cumsum(0) - 1, -1)
-        index = table.to(torch.int32).index_select(0, labels.flatten()).view(labels.shape)
-        return ids, index, torch.nn.functional.pad(table, (1, 1), value=-1)
-    ids = labels.unique_consecutive().unique()  # neither makes an int64 index of the pixels, as an inverse is
-    return ids, torch.searchsorted(ids, labels.contiguous(), out_int32=True), None
+    return ids, torch.searchsorted(ids, labels.contiguous(), out_int32=True)
+
+
+def positions_of(region_ids: Tensor, ids: Tensor) -> Tensor:
+    """Return the position of each id among sorted `ids`, int64, -1 where it is not one of them."""
+    if ids.device.type == "cpu" and not torch.compiler.is_compiling() and int(ids[-1]) < _TABLE_IDS:
+        # numpy takes a third of the time, and wakes no threads of torch's, which would spin beside the kernel's
+        table = np.full(int(ids[-1]) + 3, -1)  # also of ids below and beyond it
+        table[ids.numpy() + 1] = np.arange(len(ids))
+        return torch.from_numpy(table.take(region_ids.long().numpy() + 1, mode="clip"))
+    places = torch.searchsorted(ids, region_ids.contiguous()).clamp_max(len(ids) - 1)
+    return torch.where(ids[places] == region_ids, places, -1)
 
 
 def sample_labels(labels: Tensor, height: int, width: int) -> Tensor:

@@ -1,14 +1,13 @@
-"""Membership s_r(x, y) of pixels in regions: its definition, and tables of tiles for the kernels.
+"""Membership s_r(x, y) of pixels in regions: its definition, and the table of tiles that kernels and decoders read.
 
-`RegionMap` makes it, and documents the blur. A tile deep inside a region has s_r = 1 everywhere: it stores its label.
+`RegionMap` documents the blur. A tile deep inside a region has s_r = 1 everywhere: it has no plane.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+import functools
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,91 +15,79 @@ from torch import Tensor
 
 from .antialiasing import SmoothLabels
 from .coverage import TILE, Coverage, make_coverage
-from .widths import RADIUS_SIGMAS, find_widths
+from .labels import positions_of
+from .widths import blurs_of, reach_of
 
-T = TypeVar("T")
-
-# windows of a task, and tiles
-_TASK_WINDOWS = 32
+# tiles of a task
 _TASK_TILES = 64
-
-
-class TileMembership(NamedTuple):
-    """Which regions occur in which tile, and the membership of its pixels where a tile holds several.
-
-    Tiles are numbered in raster order, batch first: (b * tiles_y + ty) * tiles_x + tx.
-    """
-
-    keys: Tensor  # [K] int64, sorted: tile * num_regions + region
-    mask_rows: Tensor  # [K] int64, row of `masks`, -1 where the region is alone in its tile
-    masks: Tensor  # [P, tile * tile], the membership: bool (hard contours) or float64
-
-    @classmethod
-    def assemble(cls, single: Tensor, keys: Tensor, masks: Tensor) -> TileMembership:
-        """Put the keys of tiles with one region between those of regions with masks."""
-        all_keys, order = torch.cat([single, keys]).sort()
-        rows = torch.arange(len(keys), device=keys.device)
-        return cls(all_keys, torch.cat([torch.full_like(single, -1), rows])[order], masks)
-
-
-class Levels(NamedTuple):
-    """The widths of contours, and the one of each pixel."""
-
-    widths: tuple[float, ...]  # pixels, ascending
-    level: Tensor | None  # [B, H, W] int32, position in `widths`; None: one width everywhere
+_NONE = np.empty((0, 0, 0), np.int32)
 
 
 class Membership:
-    """A label map and its contour widths, with tables for the kernels, made once and kept."""
+    """The labels of pixels and the widths of their contours, at one size."""
 
     margin = 0  # pixels that what is blurred reaches farther than the labels
+    plane_dtype: type[np.floating[Any]] = np.float32
 
     def __init__(
-        self,
-        index: Tensor,
-        num_regions: int,
-        softness: float | Mapping[tuple[int, int], float] = 0.0,
+        self, labels: Tensor, ids: Tensor, blurs: Tensor | None = None, width_index: Tensor | None = None
     ) -> None:
-        """Take the labels of pixels, (B, H, W), as integers 0 ... num_regions - 1.
-
-        `softness` is the contour width in pixels, or that of each pair (a, b) of labels with a < b, 0 where absent.
-        """
-        self.index = index
-        self.num_regions = num_regions
-        self.softness = softness
-        self._derived: dict[object, Any] = {}
-
-    def __getstate__(self) -> dict[str, Any]:
-        # without tables: torch moves the memory of tensors that it sends to another process, which arrays may share
-        return {**vars(self), "_derived": {}}
+        """Take labels, (H, W) or (maps, H, W), their sorted ids, and widths as in `MapOperands`."""
+        self._labels = labels
+        self.ids = ids
+        self._blurs = blurs
+        self.width_index = width_index
 
     @property
-    def levels(self) -> Levels:
-        """Contour widths of the pixels."""
-        return self.derived("levels", _find_levels)
+    def num_regions(self) -> int:
+        """Number of ids."""
+        return len(self.ids)
 
     @property
     def smooth_labels(self) -> SmoothLabels | None:
-        """Labels to blur in place of those of the map."""
+        """Labels to blur in place of those of the map, with positions among the ids."""
         return None
+
+    @functools.cached_property
+    def labels(self) -> Tensor:
+        """The labels, (maps, H, W)."""
+        return self._labels if self._labels.ndim == 3 else self._labels[None]
+
+    @functools.cached_property
+    def blurs(self) -> Tensor:
+        """A row for each width, as of `blurs_of`."""
+        return blurs_of((0.0,), self._labels.device) if self._blurs is None else self._blurs
+
+    @functools.cached_property
+    def widths(self) -> tuple[float, ...]:
+        """The widths of contours, in pixels."""
+        return (0.0,) if self._blurs is None else tuple(self._blurs[:, 0].tolist())
+
+    @functools.cached_property
+    def index(self) -> Tensor:
+        """Position of each pixel's label among the ids, (maps, H, W) int32."""
+        return positions_of(self.labels, self.ids).int()
+
+    @functools.cached_property
+    def coverage(self) -> Coverage:
+        """The table for tiles of 16 pixels, made on the map's device."""
+        if self.index.device.type == "cpu":
+            return self._make_coverage()
+        return make_coverage(self.index, self.num_regions, self.widths, self.width_index)
 
     @property
     def radius(self) -> int:
         """Reach of the softest contour in pixels."""
-        return self._reach(self.levels.widths[-1]) + self.margin
-
-    def to(self, device: torch.device) -> Membership:
-        """Return the same membership on `device`, without tables."""
-        return Membership(self.index.to(device), self.num_regions, self.softness)
+        return reach_of(self.widths[-1]) + self.margin
 
     def weights(self, batch: int, region: int, dtype: torch.dtype) -> Tensor:
         """Evaluate s_r of one region over one whole map, (H, W): the definition, without tables."""
         inside = self._inside(batch, region)
-        widths, level = self.levels
         weights = torch.zeros_like(inside)
-        for position, width in enumerate(widths):
+        for position, width in enumerate(self.widths):
             blurred = self._blur(inside, width)
-            weights = blurred if level is None else torch.where(level[batch] == position, blurred, weights)
+            is_own = None if self.width_index is None else self.width_index[batch] == position
+            weights = blurred if is_own is None else torch.where(is_own, blurred, weights)
         return weights.to(dtype)
 
     def _inside(self, batch: int, region: int) -> Tensor:
@@ -111,191 +98,74 @@ class Membership:
         if width == 0.0:
             return inside
         axes = [torch.arange(n, device=inside.device) for n in inside.shape]
-        rows, cols = (self._gaussian(axis[:, None] - axis[None, :], width) for axis in axes)
+        rows, cols = (_gaussian(axis[:, None] - axis[None, :], width) for axis in axes)
         total = rows.sum(1)[:, None] * cols.sum(1)[None, :]
         return (rows @ inside @ cols.T) / total
 
-    def _reach(self, width: float) -> int:
-        return math.ceil(RADIUS_SIGMAS * width)
-
-    def _gaussian(self, offset: Tensor, width: float) -> Tensor:
-        distance = offset.abs().to(torch.float64)
-        gaussian = torch.exp(-0.5 * (distance / width) ** 2)
-        return torch.where(distance <= self._reach(width), gaussian, 0.0)
-
-    def tiles(self, tile: int) -> TileMembership:
-        """Return the tables for square tiles of `tile` pixels."""
-        return self.derived(("tiles", tile), lambda _: self._build_tiles(tile))
-
-    def coverage(self) -> Coverage:
-        """Return the table for tiles of 16 pixels, on the map's device."""
-        return self.derived("coverage", lambda _: self._build_coverage())
-
-    def full_map(self, batch: int, region: int, tile: int = 16) -> Tensor:
-        """Assemble s_r of one region from the tables of tiles, (H, W) float64."""
-        (maps, height, width), table = self.index.shape, self.tiles(tile)
-        rows, cols = -(-height // tile), -(-width // tile)
-        entries = (table.keys % self.num_regions == region).nonzero().flatten()
-        tiles, mask_rows = table.keys[entries] // self.num_regions, table.mask_rows[entries]
-        weights = torch.zeros(maps * rows * cols, tile * tile, dtype=torch.float64, device=self.index.device)
-        weights[tiles] = 1.0
-        is_mixed = mask_rows >= 0
-        weights[tiles[is_mixed]] = table.masks[mask_rows[is_mixed]].double()
-        image = weights.view(maps, rows, cols, tile, tile)[batch].transpose(1, 2).reshape(rows * tile, cols * tile)
+    def full_map(self, batch: int, region: int) -> Tensor:
+        """Assemble s_r of one region from the table, (H, W) float64."""
+        height, width = self.labels.shape[1:]
+        rows, cols = -(-height // TILE), -(-width // TILE)
+        starts, regions, planes, weights = self.coverage
+        image = weights.new_zeros(rows * cols, TILE * TILE, dtype=torch.float64)
+        entries = slice(int(starts[batch * rows * cols]), int(starts[(batch + 1) * rows * cols]))
+        tile = torch.repeat_interleave(starts[batch * rows * cols :][: rows * cols + 1].diff())
+        is_own = regions[entries] == region
+        tile, plane = tile[is_own], planes[entries][is_own].long()
+        image[tile[plane < 0]] = 1.0
+        image[tile[plane >= 0]] = weights[plane[plane >= 0]].double()
+        image = image.view(rows, cols, TILE, TILE).transpose(1, 2).reshape(rows * TILE, cols * TILE)
         return image[:height, :width]
 
-    def derived(self, key: object, build: Callable[[Membership], T]) -> T:
-        """Return build(self), evaluated once for each key."""
-        if key not in self._derived:
-            self._derived[key] = build(self)
-        value: T = self._derived[key]
-        return value
+    @functools.cached_property
+    def _entries(self) -> tuple[Any, Any, Any]:
+        """Starts, regions and planes of the table, as arrays."""
+        from .loops import list_regions  # loads numba
 
-    def _build_tiles(self, tile: int) -> TileMembership:
-        place, reaches = self._place_tiles(tile)
-        single, keys = self.list_keys(place, (tile, tile), reaches)
-        masks = self.window_weights(place[keys // self.num_regions], keys % self.num_regions, (tile, tile)).flatten(1)
-        return TileMembership.assemble(single, keys, masks.bool() if self.levels.widths == (0.0,) else masks)
-
-    def _place_tiles(self, tile: int) -> tuple[Tensor, Tensor]:
-        """Return map, first row and first column of each tile, (T, 3), and how far its pixels see, (T,)."""
-        widths, level = self.levels
-        maps, height, width = self.index.shape
-        counts = (maps, -(-height // tile), -(-width // tile))
-        place = torch.cartesian_prod(*[torch.arange(n, device=self.index.device) for n in counts])
-        place[:, 1:] *= tile
-        # the widest contour of a tile decides
-        reaches = torch.tensor([self._reach(contour) + self.margin for contour in widths], device=place.device)
-        widest = torch.zeros(len(place), dtype=torch.int64, device=place.device)
-        if level is not None:
-            widest = torch.nn.functional.max_pool2d(level.float(), tile, ceil_mode=True).flatten().long()
-        return place, reaches[widest]
-
-    def _build_coverage(self) -> Coverage:
-        if self.index.device.type != "cpu":
-            return make_coverage(
-                self.index, self.num_regions, *find_widths(self.index, self.num_regions, self.softness)
-            )
-        from kcgs.compiled.tasks import ranges, run_tasks  # loads numba
-
-        from .windows import fill_planes, list_regions
-
-        index, (place, reaches) = _array(self.index), self._place_tiles(TILE)
-        counts, regions = list_regions(index, place.numpy(), (TILE, TILE), reaches.numpy(), self.num_regions)
+        reaches = np.array([reach_of(width) + self.margin for width in self.widths])
+        counts, regions = list_regions(to_array(self.index), self._width_array, reaches, self.num_regions)
         starts = np.zeros(len(counts) + 1, np.int32)
         np.cumsum(counts, out=starts[1:])
         is_shared = np.repeat(counts > 1, counts)
-        ends = np.cumsum(is_shared, dtype=np.int32)
-        planes = np.where(is_shared, ends - 1, np.int32(-1))
-        weights = np.empty((ends[-1], TILE * TILE), np.float32)
-        arguments = index, *self._blur_arrays(), starts, regions, planes, weights
-        run_tasks(partial(fill_planes, *arguments), ranges(len(counts), _TASK_TILES))
-        return Coverage(*map(torch.from_numpy, (starts, regions, planes, weights)))
+        return starts, regions, np.where(is_shared, np.cumsum(is_shared, dtype=np.int32) - 1, np.int32(-1))
 
-    def list_keys(self, place: Tensor, sides: Sequence[int], reaches: Tensor) -> tuple[Tensor, Tensor]:
-        """List keys, tile * num_regions + region, of tiles with one region, and of tiles with several; both sorted.
+    @property
+    def _width_array(self) -> Any:
+        return _NONE if self.width_index is None else to_array(self.width_index)
 
-        Args:
-            place: image, first row and first column of each tile, (T, 3); at least one of its pixels is in the image.
-            sides: height and width of a tile, in pixels.
-            reaches: distance, in pixels, at which a region around a tile belongs to it, (T,).
-        """
-        from .windows import list_regions  # loads numba
+    @property
+    def num_planes(self) -> int:
+        """Planes of the table, on the CPU."""
+        return int(self._entries[2].max(initial=-1)) + 1
 
-        counts, regions = list_regions(
-            _array(self.index), _array(place), (sides[0], sides[1]), _array(reaches), self.num_regions
-        )
-        keys = np.repeat(np.arange(len(counts)), counts) * self.num_regions + regions
-        is_single = np.repeat(counts == 1, counts)
-        single, several = (torch.from_numpy(part).to(place.device) for part in (keys[is_single], keys[~is_single]))
-        return single, several
-
-    def window_weights(self, place: Tensor, region: Tensor, span: Sequence[int]) -> Tensor:
-        """Evaluate s_r over windows of `span` pixels, (P, *span) float64, of image, first row and first column, (P, 3).
-
-        Windows may reach beyond the image, where s_r has no meaning.
-        """
+    def _make_coverage(self) -> Coverage:
         from kcgs.compiled.tasks import ranges, run_tasks  # loads numba
 
-        from .windows import fill_weights
+        from .loops import fill_planes
 
-        weights = np.zeros((len(region), *span))
-        labels = self.smooth_labels
-        none = np.empty((0, 0, 0))
-        parts = (none, none.astype(np.int32), none) if labels is None else map(_array, labels)
-        arguments = _array(self.index), *parts, *self._blur_arrays(), _array(place), _array(region), weights
-        run_tasks(partial(fill_weights, *arguments), ranges(len(region), _TASK_WINDOWS))
-        return torch.from_numpy(weights).to(region.device)
-
-    def _blur_arrays(self) -> tuple[Any, Any]:
-        """Return the levels of pixels and halves of blurs, as the loops over windows take them."""
-        widths, level = self.levels
-        offsets = torch.arange(self.radius + 1)
-        taps = torch.stack([self._gaussian(offsets, width) if width else (offsets == 0).double() for width in widths])
-        return np.empty((0, 0, 0), np.int32) if level is None else _array(level), taps.numpy()
-
-    def read(self, pixels: Tensor, place: Tensor, span: Sequence[int]) -> Tensor:
-        """Read (B, H, W) over windows, (P, *span), at places as of `window_weights`; the border repeats."""
-        lines = [
-            (first[:, None] + torch.arange(side, device=pixels.device)).clamp(0, length - 1)
-            for first, side, length in zip(place.unbind(1)[1:], span, pixels.shape[1:], strict=True)
-        ]
-        return pixels[place[:, :1, None], lines[0][:, :, None], lines[1][:, None, :]]
+        starts, regions, planes = self._entries
+        weights = np.empty((self.num_planes, TILE * TILE), self.plane_dtype)
+        smooth = (_NONE.astype(float), _NONE, _NONE.astype(float))
+        if self.smooth_labels is not None:
+            smooth = tuple(map(to_array, self.smooth_labels))
+        arrays = to_array(self.index), smooth, self._width_array, to_array(self.blurs[:, 1:])
+        fill = partial(fill_planes, *arrays, starts, regions, planes, weights)
+        run_tasks(fill, ranges(len(starts) - 1, _TASK_TILES))
+        return Coverage(*map(torch.from_numpy, (starts, regions, planes, weights)))
 
     @property
     def variances(self) -> Tensor:
-        """Squared widths of contours at pixels, (B, H, W) float64."""
-        return self.derived("variances", _find_variances)
+        """Squared widths of contours at pixels, (maps, H, W) float64."""
+        squares = self.blurs[:, 0].square()
+        return squares.expand(self.labels.shape) if self.width_index is None else squares[self.width_index.long()]
 
 
-def _array(tensor: Tensor) -> Any:
+def to_array(tensor: Tensor) -> Any:
+    """Return a tensor of any device as an array in C order."""
     return tensor.cpu().contiguous().numpy()
 
 
-def _find_levels(membership: Membership) -> Levels:
-    """Give each pixel the width of its nearest contour.
-
-    The nearest pixel that touches a contour has the same label: the way to another label crosses the contour earlier.
-    So the two regions are that pixel's, and that of the first of its neighbours that differs.
-    """
-    if not isinstance(membership.softness, Mapping):
-        return Levels((membership.softness,), None)
-    from .nearest import spread  # loads numba
-
-    maps = _array(membership.index)
-    other = _neighbor_labels(maps)
-    touches = other >= 0
-    own, beside = maps[touches].astype(np.int64), other[touches]
-    keys = np.minimum(own, beside) * membership.num_regions + np.maximum(own, beside)
-    pairs, pair_index = np.unique(keys, return_inverse=True)
-    pair_widths = [membership.softness.get(divmod(pair, membership.num_regions), 0.0) for pair in pairs.tolist()]
-    if len(set(pair_widths)) < 2:
-        return Levels((pair_widths[0] if pair_widths else 0.0,), None)
-    widths, pair_levels = np.unique(pair_widths, return_inverse=True)
-    contours, level = np.full(maps.shape, -1, np.int32), np.zeros(maps.shape, np.int32)
-    contours[touches] = pair_levels[pair_index]
-    spread(contours, level)
-    return Levels(tuple(widths.tolist()), torch.from_numpy(level).to(membership.index.device))
-
-
-def _find_variances(membership: Membership) -> Tensor:
-    widths, level = membership.levels
-    squares = torch.tensor(widths, dtype=torch.float64, device=membership.index.device).square()
-    return squares.expand(membership.index.shape) if level is None else squares[level.long()]
-
-
-def _neighbor_labels(labels: Any) -> Any:
-    """Return the first label beside each pixel (above, left, right, below) that differs from its own; -1: none."""
-    other = np.full_like(labels, -1)
-    later = slice(1, None)
-    earlier = slice(None, -1)
-    every = slice(None)
-    for pixel, neighbour in (
-        ((..., later, every), (..., earlier, every)),
-        ((..., every, later), (..., every, earlier)),
-        ((..., every, earlier), (..., every, later)),
-        ((..., earlier, every), (..., later, every)),
-    ):
-        differs = (labels[pixel] != labels[neighbour]) & (other[pixel] < 0)
-        np.copyto(other[pixel], labels[neighbour], where=differs)
-    return other
+def _gaussian(offset: Tensor, width: float) -> Tensor:
+    distance = offset.abs().to(torch.float64)
+    gaussian = torch.exp(-0.5 * (distance / width) ** 2)
+    return torch.where(distance <= reach_of(width), gaussian, 0.0)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -13,12 +12,16 @@ from torch import Tensor
 from kcgs._check import check_size
 from kcgs._labels import check_labels, is_label_source
 
-from .labels import touching_pairs, union_find
-from .map_tables import MapOperands, MapTables, TableCache, make_tables, resample
-from .softness import PairSoftness, merged_softness, softness_tensor
+from .labels import compact, positions_of, sample_labels, touching_pairs, union_find
+from .membership import Membership
+from .operands import MapOperands, membership_at
+from .softness import PairSoftness, check_softness, merged_softness, scaled_softness, softness_by_position
+from .widths import blurs_of, find_widths
+
+# of a table that a map keeps: 1 GiB; every render makes that of a map of noise, which a small file may hold
+_MOST_PLANES = 1 << 20
 
 
-@dataclass(frozen=True, eq=False, repr=False)
 class RegionMap:
     r"""A label map made ready for rendering: which region each pixel belongs to, and how soft contours are.
 
@@ -29,42 +32,19 @@ class RegionMap:
     it was made from, and ``labels`` gives copies of that: whatever writes to them changes no render.
 
     Example:
-        >>> regions = RegionMap.from_labels(torch.tensor([[3, 3, 7], [3, 7, 7]]))
+        >>> regions = RegionMap(torch.tensor([[3, 3, 7], [3, 7, 7]]))
         >>> regions.num_regions, regions.size, regions.softness
         (2, (2, 3), 0.0)
     """
 
     _labels: Tensor
-    tables: MapTables
-    _softness: Tensor | None  # as the operator takes it
-    _source: RegionMap | None = None  # the map that this one was interpolated from
+    _softness: float | PairSoftness
+    _index: Tensor  # [maps, H, W] int32
+    _operands: MapOperands
+    _source: RegionMap | None  # the map that this one was interpolated from
 
-    def __post_init__(self) -> None:
-        """Cache the tables where the operator finds them."""
-        if self._source is None:
-            TableCache(self.tables).attach(self._labels)
-        elif cache := TableCache.of(self._source._labels):
-            cache.add(self.size, self.tables)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Leave out the cache, an attribute of the labels."""
-        return {**vars(self), "_labels": self._labels.detach()}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Cache the tables of a copy, too."""
-        vars(self).update(state)
-        self.__post_init__()
-
-    def __repr__(self) -> str:
-        return f"RegionMap({self.num_regions} regions, size={self.size}, softness={self.softness})"
-
-    @classmethod
-    def from_labels(
-        cls,
-        labels: Any,
-        softness: float | Mapping[tuple[int, int], float] = 0.0,
-    ) -> RegionMap:
-        r"""Build from a label map.
+    def __init__(self, labels: Any, softness: float | Mapping[tuple[int, int], float] = 0.0) -> None:
+        r"""Make a map of labels.
 
         Args:
             labels: integer or bool, a Tensor or a numpy array, :math:`(H, W)` or :math:`(B, H, W)`, non-negative; ids
@@ -81,12 +61,42 @@ class RegionMap:
 
         Example:
             >>> edge = torch.tensor([[1, 1, 1, 2], [1, 1, 1, 2]])
-            >>> RegionMap.from_labels(edge, {(2, 1): 0.7}).softness
+            >>> RegionMap(edge, {(2, 1): 0.7}).softness
             0.7
         """
         with torch.inference_mode(False):  # a graph of autograd keeps no tensor of that mode
-            labels = check_labels("labels", labels).clone()
-        return wrap_labels(labels, softness)
+            self._fill(check_labels("labels", labels).clone(), softness)
+
+    def _fill(self, labels: Tensor, softness: float | Mapping[tuple[int, int], float]) -> None:
+        """Derive all that renders read."""
+        self._labels, self._source = labels, None
+        ids, index = compact(labels)
+        self._index = index if index.ndim == 3 else index[None]
+        self._softness = check_softness(softness, ids)
+        widths, pixels = find_widths(self._index, len(ids), softness_by_position(self._softness, ids))
+        blurs = None if widths == (0.0,) else blurs_of(widths, labels.device)
+        membership = Membership(self._index, ids, blurs, pixels)
+        membership.index = self._index
+        is_noise = labels.device.type == "cpu" and membership.num_planes > _MOST_PLANES
+        operands = MapOperands(labels, blurs, pixels, ids, size=(labels.shape[-2], labels.shape[-1]))
+        self._operands = operands if is_noise else operands._replace(**membership.coverage._asdict())
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Leave out what is derived: torch moves the memory of tensors that it sends to another process."""
+        labels = self._labels if self._source is None else self._source._labels
+        return RegionMap.from_state, ({**self.state(), "labels": labels},)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> RegionMap:
+        """Return the map itself, which nothing changes."""
+        return self
+
+    def __repr__(self) -> str:
+        return f"RegionMap({self.num_regions} regions, size={self.size}, softness={self.softness})"
+
+    @classmethod
+    def from_labels(cls, labels: Any, softness: float | Mapping[tuple[int, int], float] = 0.0) -> RegionMap:
+        """Return RegionMap(labels, softness)."""
+        return cls(labels, softness)
 
     @property
     def labels(self) -> Tensor:
@@ -96,12 +106,14 @@ class RegionMap:
     @property
     def ids(self) -> Tensor:
         """The distinct ids, (R,) int64, sorted."""
-        return self.tables.ids
+        ids = self._operands.ids
+        assert ids is not None
+        return ids
 
     @property
     def softness(self) -> float | PairSoftness:
         """Softness of all contours in pixels, or that of each pair of regions."""
-        return self.tables.softness
+        return self._softness
 
     @property
     def num_maps(self) -> int | None:
@@ -119,9 +131,14 @@ class RegionMap:
         return self._labels.shape[-2], self._labels.shape[-1]
 
     @property
+    def device(self) -> torch.device:
+        """Where its tensors are."""
+        return self._labels.device
+
+    @property
     def index(self) -> Tensor:
         """Position of each pixel's label among `ids`, (B, H, W) int32, also for one map."""
-        return self.tables.membership.index
+        return self._index
 
     @property
     def is_resampled(self) -> bool:
@@ -130,7 +147,7 @@ class RegionMap:
 
     def index_of(self, region_ids: Tensor) -> Tensor:
         """Return the position of each id among `ids`, -1 where the map does not hold it."""
-        return self.tables.index_of(region_ids)
+        return positions_of(region_ids, self.ids)
 
     def membership(self, region_ids: int | Iterable[int], dtype: torch.dtype = torch.float64) -> Tensor:
         r"""Evaluate the membership of every pixel in a region, or the sum over several.
@@ -146,7 +163,7 @@ class RegionMap:
             ValueError: a batch of maps.
 
         Example:
-            >>> regions = RegionMap.from_labels(torch.tensor([[3, 3, 7, 9]]))
+            >>> regions = RegionMap(torch.tensor([[3, 3, 7, 9]]))
             >>> regions.membership([3, 9])
             tensor([[1., 1., 0., 1.]], dtype=torch.float64)
         """
@@ -154,7 +171,8 @@ class RegionMap:
             raise ValueError(f"membership needs one map; got a batch of {self.num_maps}")
         ids = [region_ids] if isinstance(region_ids, int) else sorted(set(region_ids))
         places = self.index_of(torch.tensor(ids, dtype=torch.int64, device=self.ids.device)).tolist()
-        parts = [self.tables.membership.full_map(0, place) for place in places if place >= 0]
+        membership = membership_at(self._operands)
+        parts = [membership.full_map(0, place) for place in places if place >= 0]
         black = torch.zeros(self.size, dtype=torch.float64, device=self.ids.device)
         return (sum(parts[1:], parts[0]) if parts else black).to(dtype)
 
@@ -172,7 +190,7 @@ class RegionMap:
             TypeError, ValueError: as :meth:`from_labels`; labels of another shape.
 
         Example:
-            >>> regions = RegionMap.from_labels(torch.tensor([[1, 1, 2, 5]]), {(1, 2): 0.7})
+            >>> regions = RegionMap(torch.tensor([[1, 1, 2, 5]]), {(1, 2): 0.7})
             >>> regions.relabel(torch.tensor([[1, 5, 5, 2]]), "mean").softness
             PairSoftness({(1, 2): 0.7, (1, 5): 0.7})
         """
@@ -199,7 +217,7 @@ class RegionMap:
             ValueError: an id that the map does not hold.
 
         Example:
-            >>> regions, new_ids = RegionMap.from_labels(torch.tensor([[1, 4, 6]])).merge([(6, 4)])
+            >>> regions, new_ids = RegionMap(torch.tensor([[1, 4, 6]])).merge([(6, 4)])
             >>> regions.labels, new_ids
             (tensor([[1, 4, 4]]), tensor([1, 4, 4]))
         """
@@ -208,16 +226,31 @@ class RegionMap:
         if len(new_ids.unique()) == 1:
             return None, new_ids
         labels = new_ids[self.index_of(self._labels)]
-        return RegionMap.from_labels(labels, merged_softness(self.softness, merged_id)), new_ids
+        return RegionMap(labels, merged_softness(self.softness, merged_id)), new_ids
 
     def to(self, device: torch.device | str) -> RegionMap:
         """Return the map on another device."""
         device = torch.device(device)
-        if device == self.ids.device:
-            return self
-        source = None if self._source is None else self._source.to(device)
-        softness = None if self._softness is None else self._softness.to(device)
-        return RegionMap(self._labels.to(device), self.tables.to(device), softness, source)
+        return self if device == self.device else self._with_tensors(lambda tensor: tensor.to(device))
+
+    def cuda(self) -> RegionMap:
+        """Return the map on the current CUDA device."""
+        return self._with_tensors(Tensor.cuda)
+
+    def pin_memory(self) -> RegionMap:
+        """Return the map in page-locked memory, as a DataLoader does with what it loads."""
+        return self._with_tensors(Tensor.pin_memory)
+
+    def _with_tensors(self, function: Callable[[Tensor], Tensor]) -> RegionMap:
+        """Return the map with a function of each of its tensors in place of that."""
+        if self._source is not None:
+            return self._source._with_tensors(function).resize(self.size)
+        regions = RegionMap.__new__(RegionMap)
+        parts = (function(part) if isinstance(part, Tensor) else part for part in self._operands)
+        regions._operands = MapOperands._make(parts)
+        regions._labels, regions._index = regions._operands.labels, function(self._index)
+        regions._softness, regions._source = self._softness, None
+        return regions
 
     def image(self, index: int | slice) -> RegionMap:
         """Copy one map of a batch, or a slice of it, with the regions that it has.
@@ -227,7 +260,7 @@ class RegionMap:
             IndexError: there is no such map.
 
         Example:
-            >>> RegionMap.from_labels(torch.tensor([[[1, 4]], [[1, 1]]])).image(0).labels
+            >>> RegionMap(torch.tensor([[[1, 4]], [[1, 1]]])).image(0).labels
             tensor([[1, 4]])
         """
         if self.num_maps is None:
@@ -241,13 +274,13 @@ class RegionMap:
         if isinstance(softness, Mapping):
             ids = set(labels.unique().tolist())
             softness = {pair: value for pair, value in softness.items() if ids.issuperset(pair)}
-        return RegionMap.from_labels(labels, softness)
+        return RegionMap(labels, softness)
 
     def state(self) -> dict[str, Any]:
         """Return the map as tensors, numbers and tuples, which ``torch.load(weights_only=True)`` reads.
 
         Example:
-            >>> RegionMap.from_labels(torch.tensor([[1, 2]])).state()
+            >>> RegionMap(torch.tensor([[1, 2]])).state()
             {'labels': tensor([[1, 2]]), 'softness': 0.0, 'size': (1, 2)}
         """
         if self._source is not None:
@@ -260,7 +293,7 @@ class RegionMap:
         """Return the map that :meth:`state` describes, on the device of its labels.
 
         Example:
-            >>> RegionMap.from_state(RegionMap.from_labels(torch.tensor([[1, 2]])).state())
+            >>> RegionMap.from_state(RegionMap(torch.tensor([[1, 2]])).state())
             RegionMap(2 regions, size=(1, 2), softness=0.0)
         """
         pairs = state["softness"]
@@ -283,7 +316,7 @@ class RegionMap:
             TypeError, ValueError: not two positive integers.
 
         Example:
-            >>> large = RegionMap.from_labels(torch.eye(3).long()).resize((6, 6))
+            >>> large = RegionMap(torch.eye(3).long()).resize((6, 6))
             >>> large.labels[0], large.softness
             (tensor([1, 1, 0, 0, 0, 0]), 0.5)
         """
@@ -292,14 +325,19 @@ class RegionMap:
             return self
         if self._source is not None:
             return self._source.resize((height, width))
-        labels, tables = resample(self.tables, self._labels, (height, width))
-        return RegionMap(labels, tables, self._softness, self)
+        regions = RegionMap.__new__(RegionMap)
+        regions._labels, regions._index = (sample_labels(t, height, width) for t in (self._labels, self._index))
+        regions._operands, regions._source = self._operands._replace(size=(height, width)), self
+        ratio = height * width / (self.size[0] * self.size[1])
+        regions._softness = scaled_softness(self._softness, ratio)
+        return regions
 
 
 def wrap_labels(labels: Tensor, softness: float | Mapping[tuple[int, int], float]) -> RegionMap:
     """Make the map of valid int64 labels without a copy: nobody else may write to them."""
-    tables = make_tables(labels, softness)
-    return RegionMap(labels, tables, softness_tensor(tables.softness, labels.device))
+    regions = RegionMap.__new__(RegionMap)
+    regions._fill(labels, softness)
+    return regions
 
 
 def as_region_map(value: object, name: str = "regions") -> RegionMap | None:
@@ -307,17 +345,16 @@ def as_region_map(value: object, name: str = "regions") -> RegionMap | None:
     if value is None or isinstance(value, RegionMap):
         return value
     if is_label_source(value):
-        return RegionMap.from_labels(check_labels(name, value))
+        return RegionMap(check_labels(name, value))
     raise TypeError(f"{name} must be a RegionMap, a label map or None; got {type(value).__name__}")
 
 
 def map_operands(regions: object) -> MapOperands:
     """Return a map as the operator takes it, which also checks the values of labels; refuse anything else."""
     if isinstance(regions, RegionMap):
-        source = regions if regions._source is None else regions._source
-        return MapOperands(source._labels, regions._softness, regions.size)
+        return regions._operands
     if isinstance(regions, (Tensor, np.ndarray)):  # graphs of torch 2.7 know no other form
         labels = check_labels("regions", regions, values=False)
-        return MapOperands(labels, None, (labels.shape[-2], labels.shape[-1]))
+        return MapOperands(labels, size=(labels.shape[-2], labels.shape[-1]))
     hint = ": RegionMap.from_labels reads it, once for all renders" if is_label_source(regions) else ""
     raise TypeError(f"regions must be a RegionMap, a Tensor, an array or None; got {type(regions).__name__}{hint}")

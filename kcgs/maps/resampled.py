@@ -5,15 +5,21 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from .antialiasing import SmoothLabels, antialias
 from .coverage import TILE, Coverage
-from .membership import Levels, Membership, TileMembership
+from .labels import sample_labels
+from .membership import Membership, to_array
+from .widths import blurs_of
 
+# windows of a task
+_TASK_WINDOWS = 32
 # pixels of windows and tiles that are evaluated at once: 16 MiB in float64
 _CHUNK_PIXELS = 1 << 21
 # least blur of antialiased labels, in pixels of the map
@@ -23,28 +29,25 @@ PIXEL = 1 / 4
 
 
 class SmoothMembership(Membership):
-    """Membership of antialiased labels: what is interpolated between the pixels of a map.
+    """Membership of antialiased labels: what is interpolated between the pixels of a map, on the CPU.
 
     Labels are blurred by the softness of contours, but by `LEAST_BLUR` at least. Weights do not sum to one.
     """
 
     margin = 1
+    plane_dtype = np.float64
 
     def __init__(self, source: Membership) -> None:
         """Take the map at its own size."""
-        super().__init__(source.index, source.num_regions, source.softness)
+        blurs = blurs_of([max(width, LEAST_BLUR) for width in source.widths], torch.device("cpu"))
+        width_index = None if source.width_index is None else source.width_index.cpu()
+        super().__init__(source.labels.cpu(), source.ids.cpu(), blurs, width_index)
         self.source = source
 
-    @property
-    def levels(self) -> Levels:
-        """Widths of the blur of pixels."""
-        widths, level = self.source.levels
-        return Levels(tuple(max(width, LEAST_BLUR) for width in widths), level)
-
-    @property
+    @functools.cached_property
     def smooth_labels(self) -> SmoothLabels:
         """The antialiased labels."""
-        return self.derived("labels", lambda _: antialias(self.index, self.source.variances < LEAST_BLUR**2))
+        return antialias(self.index, (self.source.variances < LEAST_BLUR**2).cpu())
 
     def _inside(self, batch: int, region: int) -> Tensor:
         weight, other, other_weight = (part[batch] for part in self.smooth_labels)
@@ -69,80 +72,120 @@ class Resampled(Membership):
     without the blur of the map's pixels, and as a pixel of the new size, half of which is a standard deviation.
     """
 
-    def __init__(self, index: Tensor, source: Membership) -> None:
-        """Take labels at the new size, (B, H, W), and the map at its own."""
-        super().__init__(index, source.num_regions, source.softness)
-        self.original = source
-        self.source = source.derived("smooth", SmoothMembership)
-        self.ratio = index.shape[1] * index.shape[2] / (source.index.shape[1] * source.index.shape[2])
+    def __init__(self, smooth: SmoothMembership, size: tuple[int, int]) -> None:
+        """Take what is interpolated, and a size."""
+        source = smooth.source
+        super().__init__(sample_labels(source.labels, *size), source.ids, source.blurs, source.width_index)
+        self.source, self.smooth = source, smooth
+        self.ratio = math.prod(size) / math.prod(source.labels.shape[1:])
 
-    def to(self, device: torch.device) -> Resampled:
-        """Return the same membership on `device`, without tables."""
-        return Resampled(self.index.to(device), self.original.to(device))
+    @functools.cached_property
+    def coverage(self) -> Coverage:
+        """The table for tiles of 16 pixels, made on the CPU."""
+        return Coverage(*(part.to(self.labels.device) for part in self._make_coverage()))
 
     def weights(self, batch: int, region: int, dtype: torch.dtype) -> Tensor:
         """Evaluate s_r of one region over one whole map, (H, W): the definition, without tables."""
-        exponent, largest, total = self.derived(("sums", batch), lambda _: self._sums(batch))
-        return ((self._interpolated(batch, region) / largest) ** exponent / total).to(dtype)
+        exponent, largest, total = self._sums[batch]
+        return ((self._interpolated(batch, region) / largest) ** exponent / total).to(self.labels.device, dtype)
 
-    def _sums(self, batch: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the exponents e of a map, the largest u of each pixel, and the sum of all (u / largest)**e."""
-        exponent = sharpness(self._interpolate(self.original.variances[batch]), self.ratio)
-        regions = range(self.num_regions)
-        largest = functools.reduce(torch.maximum, (self._interpolated(batch, r) for r in regions))
-        powers = ((self._interpolated(batch, r) / largest) ** exponent for r in regions)
-        return exponent, largest, functools.reduce(torch.add, powers)
+    @functools.cached_property
+    def _sums(self) -> list[tuple[Tensor, Tensor, Tensor]]:
+        """The exponents e of each map, the largest u of each pixel, and the sum of all (u / largest)**e."""
+        sums = []
+        for batch in range(len(self.labels)):
+            exponent = sharpness(self._interpolate(self.source.variances[batch].cpu()), self.ratio)
+            regions = range(self.num_regions)
+            largest = functools.reduce(torch.maximum, (self._interpolated(batch, r) for r in regions))
+            powers = ((self._interpolated(batch, r) / largest) ** exponent for r in regions)
+            sums.append((exponent, largest, functools.reduce(torch.add, powers)))
+        return sums
 
     def _interpolated(self, batch: int, region: int) -> Tensor:
-        return self._interpolate(self.source.weights(batch, region, torch.float64))
+        return self._interpolate(self.smooth.weights(batch, region, torch.float64))
 
     def _interpolate(self, pixels: Tensor) -> Tensor:
-        down, across = self._matrices(pixels.shape)
+        first = torch.zeros(1, dtype=torch.int64)
+        down, across = (_matrix(axis, first, n)[0] for axis, n in zip(self._axes(1), pixels.shape, strict=True))
         return down @ pixels @ across.T
 
-    def _matrices(self, shape: Sequence[int]) -> Iterator[Tensor]:
-        """Yield the matrices that interpolate columns and rows of a map of this shape."""
-        first = torch.zeros(1, dtype=torch.int64, device=self.index.device)
-        return (_matrix(axis, first, n)[0] for axis, n in zip(self._axes(1), shape, strict=True))
-
-    def _axes(self, tile: int) -> tuple[_Axis, _Axis]:
+    def _axes(self, tile: int) -> list[_Axis]:
         """Return the axes of rows and columns, padded to whole tiles with their last pixel."""
-        sizes = zip(self.index.shape[1:], self.source.index.shape[1:], strict=True)
-        return tuple(_axis(new, old, tile, self.index.device) for new, old in sizes)  # type: ignore[return-value]
+        sizes = zip(self.labels.shape[1:], self.source.labels.shape[1:], strict=True)
+        return [_axis(new, old, tile) for new, old in sizes]
 
-    def _build_coverage(self) -> Coverage:
-        keys, rows, masks = self.tiles(TILE)
-        tiles = self.index.shape[0] * math.prod(-(-side // TILE) for side in self.index.shape[1:])
-        firsts = torch.arange(tiles + 1, device=keys.device) * self.num_regions
-        starts = torch.searchsorted(keys, firsts, out_int32=True)
-        return Coverage(starts, (keys % self.num_regions).int(), rows.int(), masks.float())
-
-    def _build_tiles(self, tile: int) -> TileMembership:
-        maps = self.index.shape[0]
-        axes = self._axes(tile)
-        firsts = [axis.low[::tile] for axis in axes]
-        spans = [int((axis.high[tile - 1 :: tile] - first).max()) + 1 for axis, first in zip(axes, firsts, strict=True)]
+    def _make_coverage(self) -> Coverage:
+        axes = self._axes(TILE)
+        firsts = [axis.low[::TILE] for axis in axes]
+        spans = [int((axis.high[TILE - 1 :: TILE] - first).max()) + 1 for axis, first in zip(axes, firsts, strict=True)]
         down, across = (
-            _matrix(_Axis(*(part.view(-1, tile) for part in axis)), first, span)
+            _matrix(_Axis(*(part.view(-1, TILE) for part in axis)), first, span)
             for axis, first, span in zip(axes, firsts, spans, strict=True)
-        )  # [tiles of the axis, tile, span] each
-        place = torch.cartesian_prod(*[torch.arange(n, device=firsts[0].device) for n in (maps, *map(len, firsts))])
-        batch, row, col = place.unbind(1)
+        )  # [tiles of the axis, 16, span] each
+        counts = (len(self.labels), *map(len, firsts))
+        batch, row, col = torch.cartesian_prod(*map(torch.arange, counts)).unbind(1)
         corners = torch.stack([batch, firsts[0][row], firsts[1][col]], 1)
-        single, keys = self.source.list_keys(corners, spans, torch.full_like(row, self.source.radius))
-        tiles, region = keys // self.num_regions, keys % self.num_regions
-        groups = tiles.unique(return_inverse=True)[1]
-        masks = torch.zeros(len(keys), tile * tile, dtype=torch.float64, device=keys.device)
-        length = max(1, _CHUNK_PIXELS // (spans[0] * spans[1] + tile * tile))
-        variances = self.original.variances
-        for chunk in _chunks(groups, length):  # all regions of a tile are in one
-            t, position = tiles[chunk].unique_consecutive(return_inverse=True)
+        tile, region = find_windows(self.smooth, corners, spans)
+        is_shared = torch.bincount(tile)[tile] > 1
+        shared = is_shared.nonzero().flatten()
+        planes = torch.zeros(len(shared), TILE * TILE, dtype=torch.float64)
+        length = max(1, _CHUNK_PIXELS // (math.prod(spans) + TILE * TILE))
+        variances = self.source.variances.cpu()
+        for chunk in _chunks(tile[shared], length):  # all regions of a tile are in one
+            pairs = shared[chunk]
+            t, position = tile[pairs].unique_consecutive(return_inverse=True)
             y, x = down[row[t]], across[col[t]].mT
-            exponent = sharpness(y @ self.source.read(variances, corners[t], spans) @ x, self.ratio)
-            windows = self.source.window_weights(corners[t[position]], region[chunk], spans)
-            masks[chunk] = _sharpen(y[position] @ windows @ x[position], position, exponent[position]).flatten(1)
-        is_present = (masks > 0).any(1)
-        return TileMembership.assemble(single, keys[is_present], masks[is_present])
+            exponent = sharpness(y @ _read(variances, corners[t], spans) @ x, self.ratio)
+            windows = cut_windows(self.smooth, corners[t[position]], region[pairs], spans)
+            planes[chunk] = _sharpen(y[position] @ windows @ x[position], position, exponent[position]).flatten(1)
+        # some of a tile's regions have no weight there
+        is_present = (planes > 0).any(1)
+        is_listed = ~is_shared
+        is_listed[shared] = is_present
+        starts = torch.searchsorted(tile[is_listed], torch.arange(math.prod(counts) + 1), out_int32=True)
+        rows = torch.where(is_shared, is_shared.cumsum(0) - 1, -1)
+        rows[shared] = torch.where(is_present, is_present.cumsum(0) - 1, -1)
+        weights = planes[is_present].float()
+        return Coverage(starts, region[is_listed].int(), rows[is_listed].int(), weights)
+
+
+def find_windows(membership: Membership, places: Tensor, span: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """List the regions of windows of `span` pixels at places, (T, 3): the window of each, ascending, and the region.
+
+    Places are map, first row and first column. Regions are those of the tiles that a window touches.
+    """
+    from .loops import list_window_regions  # loads numba
+
+    starts, regions = (to_array(part) for part in membership.coverage[:2])
+    shape = tuple(membership.labels.shape)
+    arguments = starts, regions, shape, to_array(places), tuple(span), membership.num_regions
+    counts, found = map(torch.from_numpy, list_window_regions(*arguments))
+    return torch.repeat_interleave(counts), found.long()
+
+
+def cut_windows(membership: Membership, places: Tensor, regions: Tensor, span: Sequence[int]) -> Tensor:
+    """Read s_r over windows of `span` pixels at places, (P, 3), out of the table: (P, *span) float64.
+
+    Windows may reach beyond the image, where s_r has no meaning.
+    """
+    from kcgs.compiled.tasks import ranges, run_tasks  # loads numba
+
+    from .loops import cut_windows as cut
+
+    windows = np.empty((len(regions), *span))
+    table, shape = map(to_array, membership.coverage), tuple(membership.labels.shape)
+    loop = partial(cut, *table, shape, to_array(places), to_array(regions), windows)
+    run_tasks(loop, ranges(len(regions), _TASK_WINDOWS))
+    return torch.from_numpy(windows)
+
+
+def _read(pixels: Tensor, places: Tensor, span: Sequence[int]) -> Tensor:
+    """Read (maps, H, W) over windows, (P, *span); the border repeats."""
+    lines = [
+        (first[:, None] + torch.arange(side)).clamp(0, length - 1)
+        for first, side, length in zip(places.unbind(1)[1:], span, pixels.shape[1:], strict=True)
+    ]
+    return pixels[places[:, :1, None], lines[0][:, :, None], lines[1][:, None, :]]
 
 
 def contour_variance(variance: Tensor, ratio: float | Tensor) -> Tensor:
@@ -167,7 +210,7 @@ def _sharpen(weights: Tensor, position: Tensor, exponent: Tensor) -> Tensor:
 
 def _chunks(groups: Tensor, length: int) -> Iterator[Tensor]:
     """Split rows, by ascending group, into chunks of whole groups, of about `length` rows."""
-    numbers = torch.arange(len(groups), device=groups.device)
+    numbers = torch.arange(len(groups))
     if len(groups) == 0:
         return
     begins = (groups.diff(prepend=groups[:1] - 1) > 0).nonzero().flatten().tolist()
@@ -179,8 +222,8 @@ def _chunks(groups: Tensor, length: int) -> Iterator[Tensor]:
     yield numbers[start:]
 
 
-def _axis(new: int, old: int, tile: int, device: torch.device) -> _Axis:
-    position = (torch.arange(new, device=device, dtype=torch.float64) + 0.5) * (old / new) - 0.5
+def _axis(new: int, old: int, tile: int) -> _Axis:
+    position = (torch.arange(new, dtype=torch.float64) + 0.5) * (old / new) - 0.5
     position = torch.nn.functional.pad(position, (0, -new % tile), value=float(position[-1]))
     low = position.floor()
     return _Axis(low.long().clamp(0, old - 1), (low.long() + 1).clamp(0, old - 1), position - low)
@@ -188,7 +231,7 @@ def _axis(new: int, old: int, tile: int, device: torch.device) -> _Axis:
 
 def _matrix(axis: _Axis, first: Tensor, span: int) -> Tensor:
     """Return the matrix from the pixels of a window to the new ones between them, (tiles, n, span)."""
-    pixel = torch.arange(span, device=first.device) + first.view(-1, 1, 1)
+    pixel = torch.arange(span) + first.view(-1, 1, 1)
     low, high = (side.reshape(len(first), -1, 1) == pixel for side in axis[:2])
     weight = axis.weight.reshape(len(first), -1, 1)
     return low * (1 - weight) + high * weight

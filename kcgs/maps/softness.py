@@ -11,7 +11,6 @@ from torch import Tensor
 from kcgs._check import check_number
 
 from .resampled import contour_variance
-from .widths import RADIUS_SIGMAS
 
 MAX_SOFTNESS = 64.0  # pixels: a wider blur is no contour
 _PRINTED_PAIRS = 4  # of a repr
@@ -66,6 +65,14 @@ def check_softness(softness: object, ids: Tensor) -> float | PairSoftness:
     return PairSoftness(pixels) if len(distinct) > 1 else distinct.pop() if distinct else 0.0
 
 
+def softness_by_position(softness: float | PairSoftness, ids: Tensor) -> float | dict[tuple[int, int], float]:
+    """Return softness with the places of ids among the sorted ones in place of ids."""
+    if not isinstance(softness, PairSoftness):
+        return softness
+    position = {region: place for place, region in enumerate(ids.tolist())}
+    return {(position[a], position[b]): value for (a, b), value in softness.items()}
+
+
 def scaled_softness(softness: float | PairSoftness, ratio: float) -> float | PairSoftness:
     """Return the softness of a map with so many new pixels per pixel, as rendered, at most `MAX_SOFTNESS`."""
     if not isinstance(softness, PairSoftness):
@@ -90,33 +97,3 @@ def merged_softness(
         if low != high:
             parts.setdefault((low, high), []).append(value)
     return {pair: sum(values) / len(values) for pair, values in parts.items()}
-
-
-# As a tensor, for the operator
-
-
-def softness_tensor(softness: float | PairSoftness, device: torch.device) -> Tensor | None:
-    """Return softness as the operator takes it, float64; None: all contours are hard.
-
-    One softness, then half of its blur, from the middle, at the pixels of the map: (1 + taps,). Or, sorted, a row for
-    each pair of ids before softness and blur: (P, 3 + taps). So the shape says how far contours reach.
-    """
-    if softness == 0.0:
-        return None
-    pixels = torch.tensor([softness] if isinstance(softness, float) else list(softness.values()), dtype=torch.float64)
-    reach = (RADIUS_SIGMAS * pixels).ceil()[:, None]
-    distance = torch.arange(int(reach.max()) + 1, dtype=torch.float64)
-    blurs = torch.exp(-0.5 * (distance / pixels[:, None].clamp_min(1e-9)) ** 2)
-    rows = torch.cat([pixels[:, None], torch.where(distance <= reach, blurs, 0.0)], 1)
-    if isinstance(softness, float):
-        return rows[0].to(device)
-    return torch.cat([torch.tensor(list(softness), dtype=torch.float64), rows], 1).to(device)
-
-
-def softness_of(tensor: Tensor | None) -> float | PairSoftness:
-    """Return the softness that :func:`softness_tensor` made a tensor of."""
-    if tensor is None:
-        return 0.0
-    if tensor.ndim == 1:
-        return float(tensor[0])
-    return PairSoftness({(int(a), int(b)): value for a, b, value in tensor[:, :3].tolist()})

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -31,12 +32,24 @@ def reach_of(width: float) -> int:
     return math.ceil(RADIUS_SIGMAS * width)
 
 
+def blurs_of(widths: Sequence[float], device: torch.device) -> Tensor:
+    """Return a row for each width, float64: the width, then half of its blur, from the middle; the shape says how far.
+
+    Other devices than the CPU are not waited for.
+    """
+    width = torch.tensor(widths, dtype=torch.float64)[:, None]
+    distance = torch.arange(reach_of(max(widths)) + 1, dtype=torch.float64)
+    taps = torch.exp(-0.5 * (distance / width.clamp_min(1e-9)) ** 2)
+    taps = torch.where(distance <= (RADIUS_SIGMAS * width).ceil(), taps, 0.0)
+    return torch.cat([width, taps], 1).to(device, non_blocking=True)
+
+
 def find_widths(index: Tensor, num_regions: int, softness: float | Mapping[tuple[int, int], float]) -> ContourWidths:
     """Give each pixel the width of its nearest contour, on the map's device, which the host does not wait for.
 
     The nearest pixel that touches a contour has the same label: the way to another label crosses the contour earlier.
     So the two regions are that pixel's, and that of the first of its neighbours that differs. Of pixels equally near
-    the leftmost counts, then the uppermost. Pixels that no contour reaches have the least width.
+    the leftmost counts, then the uppermost. Pixels that no contour reaches have any width.
 
     Args:
         index: position of each pixel's region among the sorted ids, (maps, H, W) int32.
@@ -45,6 +58,31 @@ def find_widths(index: Tensor, num_regions: int, softness: float | Mapping[tuple
     """
     if not isinstance(softness, Mapping):
         return ContourWidths((softness,), None)
+    search = spread_widths if index.device.type == "cpu" else search_widths
+    return search(index, num_regions, softness)
+
+
+def spread_widths(index: Tensor, num_regions: int, softness: Mapping[tuple[int, int], float]) -> ContourWidths:
+    """Find the widths on the CPU; those that no contour has go."""
+    from .nearest import spread  # loads numba
+
+    other = _neighbor_labels(index).numpy()
+    maps, touches = index.numpy(), other >= 0
+    own, beside = maps[touches].astype(np.int64), other[touches]
+    keys = np.minimum(own, beside) * num_regions + np.maximum(own, beside)
+    pairs, pair_index = np.unique(keys, return_inverse=True)
+    pair_widths = [softness.get(divmod(pair, num_regions), 0.0) for pair in pairs.tolist()]
+    if len(set(pair_widths)) < 2:
+        return ContourWidths((pair_widths[0] if pair_widths else 0.0,), None)
+    widths, places = np.unique(pair_widths, return_inverse=True)
+    contours, pixels = np.full(maps.shape, -1, np.int32), np.zeros(maps.shape, np.int32)
+    contours[touches] = places[pair_index]
+    spread(contours, pixels)
+    return ContourWidths(tuple(widths.tolist()), torch.from_numpy(pixels))
+
+
+def search_widths(index: Tensor, num_regions: int, softness: Mapping[tuple[int, int], float]) -> ContourWidths:
+    """Find the widths on any device, by a search along columns, then along rows, within the reach of the widest."""
     widths = tuple(sorted({0.0, *softness.values()}))
     places = {width: place for place, width in enumerate(widths)}
     other = _neighbor_labels(index)

@@ -29,11 +29,11 @@ class BlurredWindows:
     def __init__(self, g: Graph, membership: Membership, tiles: Tiles, tiles_of: Mapping[int, Integers]) -> None:
         self.graph = g
         self.tiles_of = tiles_of
-        ids, (_, level) = tile_ids(tiles_of), membership.levels
-        levels = np.zeros((len(ids), WINDOW, WINDOW), np.int64)
-        if level is not None:
-            levels = cut_windows(tiles, ids, level[0].cpu().numpy())
-        parts, self.places = _list_parts(tiles, ids, levels)
+        ids, index = tile_ids(tiles_of), membership.width_index
+        width_index = np.zeros((len(ids), WINDOW, WINDOW), np.int64)
+        if index is not None:
+            width_index = cut_windows(tiles, ids, index[0].cpu().numpy())
+        parts, self.places = _list_parts(tiles, ids, width_index)
         axes = g.constant([1, 2])
         window, region, width = (pack_runs(g, column) for column in parts)
         region = g.Unsqueeze(region, axes)
@@ -52,9 +52,9 @@ class BlurredWindows:
             inside = inside * next(weights) + taken * next(weights)
         # outside the map there is no label, and no membership
         blurred = blur(inside) / g.Max(blur(g.Less(pixels, np.int32(len(table) - 1))), 1e-30)
-        self.levels = None if level is None else pack_windows(g, levels)  # (T, S, S), place among the map's widths
-        if self.levels is not None:
-            blurred = blurred * g.Equal(self.levels[window], g.Unsqueeze(width, axes)).astype(FLOAT)
+        if index is not None:
+            is_own = g.Equal(pack_windows(g, width_index)[window], g.Unsqueeze(width, axes))
+            blurred = blurred * is_own.astype(FLOAT)
         self.parts = g.Concat(np.zeros((1, WINDOW, WINDOW), np.float32), blurred, axis=0)
 
     def unfold(self, count: int) -> Value:
@@ -89,7 +89,7 @@ def cut_windows(tiles: Tiles, ids: Integers, grid: Integers) -> Integers:
     return windows[ids]
 
 
-def _list_parts(tiles: Tiles, ids: Integers, levels: Integers) -> tuple[Integers, dict[int, Integers]]:
+def _list_parts(tiles: Tiles, ids: Integers, width_index: Integers) -> tuple[Integers, dict[int, Integers]]:
     """List the window, region and width of each part, (3, parts), and the places of each tile's, [regions, widths].
 
     Place 0 is that of zeros.
@@ -97,7 +97,7 @@ def _list_parts(tiles: Tiles, ids: Integers, levels: Integers) -> tuple[Integers
     triples: list[tuple[int, int, int]] = []
     places: dict[int, Integers] = {}
     for number, tile in enumerate(ids.tolist()):
-        pairs = list(product(tiles.regions[tile], np.unique(levels[number]).tolist()))
+        pairs = list(product(tiles.regions[tile], np.unique(width_index[number]).tolist()))
         places[tile] = 1 + len(triples) + np.arange(len(pairs)).reshape(len(tiles.regions[tile]), -1)
         triples += [(number, *pair) for pair in pairs]
     return np.array(triples).T, places
@@ -108,7 +108,7 @@ def _kernels(g: Graph, membership: Membership) -> Value:
 
     The taps are those of `kcgs.maps.membership`, by operators, since a file that stored them would be larger.
     """
-    widths, radius = np.array(membership.levels.widths), membership.radius
+    widths, radius = np.array(membership.widths), membership.radius
     distance = np.abs(np.arange(WINDOW)[:, None] - np.arange(WINDOW + 2 * radius) + radius).astype(np.float32)
     ends, sigma = np.ceil(RADIUS_SIGMAS * widths), np.maximum(widths, 1e-3)
     falloff = g.Div(distance, sigma.astype(np.float32)[:, None, None])

@@ -63,7 +63,7 @@ def scene_decoder(
     down, across, visible = _inputs(g, scene, interactive)
     storage = store_entries(g, plan, visible)
     blocks = BlockRenderer(storage, down, across, cutoff)
-    membership = None if regions is None else make_membership(storage, regions, down, across)
+    membership = make_membership(storage, down, across)
     grids = None if storage.table is None else CoarseGrids(storage, storage.table, down, across, cutoff)
     image = _crop(g, blocks.image(membership, grids), down, across)
     if clamp:

@@ -40,7 +40,7 @@ class CoarseGrids:
         """Sample tiles of one region, (C, V, pieces * side, width) with pixels to spare; the others are zero."""
         g, tiles, channels = self.graph, self.storage.plan.tiles, self.storage.channels
         no_region = self.table.nodes.no_region
-        regions = [no_region if number in tiles.windows else ids[0] for number, ids in enumerate(tiles.regions)]
+        regions = [no_region if number in tiles.several else ids[0] for number, ids in enumerate(tiles.regions)]
         region = pack_runs(g, np.array(regions))
         values = self._window(region, g.Range(np.int32(0), np.int32(len(regions)), np.int32(1)))
         values = g.Reshape(values, [tiles.rows, tiles.cols, channels, NODES, NODES])

@@ -49,7 +49,7 @@ def group_tiles(pairs: Integers, is_narrow: NDArray[np.bool_], tiles: Tiles, num
     narrow_lengths = np.bincount(pairs[1, is_narrow[pairs[0]]], minlength=count + num_nodes)
     kinds: dict[tuple[bool, int, bool], list[tuple[int, int]]] = {}
     for number, length in enumerate(lengths.tolist()):
-        regions = len(tiles.regions[number]) if number in tiles.windows else 1
+        regions = len(tiles.regions[number]) if number in tiles.several else 1
         # a tile with several regions needs a list for what comes from coarser grids, too
         if length or (num_nodes and regions > 1):
             # few kinds: numbers of regions rise by powers of two

@@ -6,14 +6,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from kcgs.functional import RegionMap
 from kcgs.maps import LEAST_BLUR, PIXEL
 
 from .axis import Axis, Interpolator
 from .blur import BlurredWindows, cut_windows
 from .entries import Storage
 from .graph import Graph, Value
-from .tiles import WINDOW, smooth_membership
+from .tiles import WINDOW
 from .windows import pack_windows, split_tiles, stored_windows, tile_ids
 
 # pixels that a contour may reach where its blur is computed in the graph
@@ -22,25 +21,25 @@ _FARTHEST = 16
 _TINY = 1e-6
 
 
-def make_membership(storage: Storage, regions: RegionMap, down: Axis, across: Axis) -> MembershipSampler | None:
+def make_membership(storage: Storage, down: Axis, across: Axis) -> MembershipSampler | None:
     """Store the windows of a map; None where no tile has several regions."""
-    g, tiles, membership = storage.graph, storage.plan.tiles, regions.tables.membership
-    tiles_of = storage.plan.mixed_tiles
-    if not tiles_of:
+    g, tiles, tiles_of = storage.graph, storage.plan.tiles, storage.plan.mixed_tiles
+    membership, smooth = tiles.membership, tiles.smooth
+    if not tiles_of or membership is None or smooth is None:
         return None
     places = Interpolator(down, across, down.sampling(), across.sampling(), WINDOW)
     ratio = 1 / (down.step * across.step)
-    smooth, (widths, level) = smooth_membership(regions), membership.levels
+    widths, width_index = membership.widths, membership.width_index
     stored = smooth.radius > _FARTHEST
     windows, smooth_windows = (
         stored_windows(g, m, tiles, tiles_of) if stored else BlurredWindows(g, m, tiles, tiles_of).unfold
         for m in (membership, smooth)
     )
-    if level is None:
+    if width_index is None:
         exponent = _sharpness(g, g.constant(np.array([widths[0] ** 2], np.float32)), ratio)
         return MembershipSampler(g, places, windows, smooth_windows, lambda *_: exponent)
-    levels = pack_windows(g, cut_windows(tiles, tile_ids(tiles_of), level[0].cpu().numpy()))
-    variances = split_tiles(g, tiles_of, g.constant(np.array(widths, np.float32) ** 2)[levels])
+    width = pack_windows(g, cut_windows(tiles, tile_ids(tiles_of), width_index[0].cpu().numpy()))
+    variances = split_tiles(g, tiles_of, g.constant(np.array(widths, np.float32) ** 2)[width])
 
     def sample(count: int, slots: Value, row: Value, col: Value) -> Value:
         return _sharpness(g, places.blocks(variances[count][slots], row, col, (1, 1)), ratio)

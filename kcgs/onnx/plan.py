@@ -86,8 +86,8 @@ def plan_decoder(field: GaussianField, regions: RegionMap | None, cutoff: float)
     region = torch.zeros(field.num_gaussians, dtype=torch.int64)
     if regions is not None and field.region_ids is not None:
         region = regions.index_of(field.region_ids).cpu()
-    keys = [number * num_regions + r for number, present in enumerate(tiles.regions) for r in present]
-    blocks = make_blocks(torch.tensor(keys), num_regions, (1, *field.size))
+    starts = np.cumsum([0, *map(len, tiles.regions)])
+    blocks = make_blocks(starts, np.concatenate(tiles.regions), num_regions, (1, *field.size))
     coarsened, gaussian, block = _pair(field, region, num_regions, blocks, cutoff)
     nodes, number = _number_blocks(blocks, num_regions, tiles, block)
     tile = number[block]
@@ -114,25 +114,25 @@ def _pair(
     gaussian, block = pair_with_blocks(fine, region, num_regions, blocks, cutoff)
     coarse = place_gaussians(means, cholesky, cutoff, len(blocks.grids))
     saved = int((coarse.level[gaussian] > 0).sum())
-    if saved <= _GRIDS_COST + _SPLINE_COST * blocks.first:
+    if saved <= _GRIDS_COST + _SPLINE_COST * blocks.levels[1]:
         return fine, gaussian, block
     return coarse, *pair_with_blocks(coarse, region, num_regions, blocks, cutoff)
 
 
 def _number_blocks(blocks: Blocks, num_regions: int, tiles: Tiles, block: Tensor) -> tuple[NodeBlocks | None, Tensor]:
     """Return the blocks of nodes where anything is, and the numbers of all blocks."""
-    number = blocks.keys // num_regions
+    number, levels = torch.from_numpy(blocks.tiles), blocks.levels
     is_needed = torch.zeros(len(number) + 1, dtype=torch.bool)
     is_needed[block] = True
-    if not is_needed[blocks.first :].any():
+    if not is_needed[levels[1] :].any():
         return None, number
-    for first, end in reversed(list(pairwise(blocks.starts[1:]))):
+    for first, end in reversed(list(pairwise(levels[1:]))):
         is_needed[first:end] |= is_needed[blocks.parents[first:end]].any(1)
-    ids = is_needed[blocks.first : -1].nonzero()[:, 0] + blocks.first
-    level = torch.searchsorted(torch.tensor(blocks.starts[1:]), ids, right=True) - 1
+    ids = is_needed[levels[1] : -1].nonzero()[:, 0] + levels[1]
+    level = torch.searchsorted(torch.tensor(levels[1:]), ids, right=True) - 1
     cols, first_tile = torch.tensor([[grid.cols, grid.first_tile] for grid in blocks.grids[1:]])[level].T
-    tile = number[ids] - first_tile
-    place = torch.stack([level, blocks.keys[ids] % num_regions, tile // cols, tile % cols], -1).numpy()
+    tile, region = number[ids] - first_tile, torch.from_numpy(blocks.regions)[ids]
+    place = torch.stack([level, region, tile // cols, tile % cols], -1).numpy()
     order = np.lexsort(place.T[::-1])
     number[ids[order]] = len(tiles.regions) + torch.arange(len(place))
     shape = (int(level.max()) + 2, num_regions + 1, tiles.rows // 2 + 1, tiles.cols // 2 + 1)

@@ -28,6 +28,7 @@ def pair_with_blocks(
 ) -> tuple[Tensor, Tensor]:
     """Pair Gaussians, (P,), with the blocks of their level and region, (P,), that they reach, between pixels too."""
     radius = support_radius(cutoff, torch.float32)
+    keys = torch.from_numpy(blocks.tiles * num_regions + blocks.regions)
     gaussians, numbers = [], []  # of each level
     for level, grid in enumerate(blocks.grids):
         ids = (coarsened.level == level).nonzero()[:, 0]
@@ -35,7 +36,7 @@ def pair_with_blocks(
         size = (grid.height, grid.width)
         gaussian, column_row, origin = bounding_tiles(means, cholesky, radius, size, between=level == 0)
         tile = grid.first_tile + column_row[:, 1] * grid.cols + column_row[:, 0]
-        block, present = find_keys(blocks.keys, tile, regions[gaussian], num_regions)
+        block, present = find_keys(keys, tile, regions[gaussian], num_regions)
         parts = zip(origin[present].split(_CHUNK), gaussian[present].split(_CHUNK), strict=True)
         distance = torch.cat([_least_distance(offset, cholesky[part]) for offset, part in parts])
         reached = present.clone()

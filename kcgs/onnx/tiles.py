@@ -9,59 +9,55 @@ from torch import Tensor
 
 from kcgs.functional import RegionMap
 from kcgs.kernels.tiles import TILE
-from kcgs.maps import Membership, SmoothMembership
+from kcgs.maps import Membership, SmoothMembership, cut_windows, find_windows, map_operands, membership_at
 
 # side of a window: a tile and the pixels around it, those of the border of the scene repeated beyond it
 WINDOW = TILE + 2
 
 
 class Tiles(NamedTuple):
-    """The tiles of a scene in raster order, and the windows of those with several regions."""
+    """The tiles of a scene in raster order."""
 
     rows: int
     cols: int
     regions: list[list[int]]  # of each tile, positions in the map: those with any membership in its window
-    windows: dict[int, Tensor]  # [K, WINDOW, WINDOW] weights of `SmoothMembership`, by tile
+    several: set[int]  # tiles with several regions
+    membership: Membership | None = None  # at the size of the scene
+    smooth: SmoothMembership | None = None  # what is interpolated between its pixels
 
 
 def find_tiles(regions: RegionMap | None, size: tuple[int, int]) -> Tiles:
     """Find the regions of every tile."""
     rows, cols = -(-size[0] // TILE), -(-size[1] // TILE)
     if regions is None or regions.num_regions == 1:
-        return Tiles(rows, cols, [[0]] * (rows * cols), {})
-    membership, count = smooth_membership(regions), regions.num_regions
-    keys = membership.tiles(TILE).keys.cpu()
+        return Tiles(rows, cols, [[0]] * (rows * cols), set())
+    membership = membership_at(map_operands(regions))
+    smooth = SmoothMembership(membership)
     # a window reaches into the tiles around it
-    steps = torch.arange(-1, 2)
-    y = (keys // count // cols)[:, None, None] + steps[:, None]
-    x = (keys // count % cols)[:, None, None] + steps
-    inside = (y >= 0) & (y < rows) & (x >= 0) & (x < cols)
-    keys = ((y * cols + x) * count + (keys % count)[:, None, None])[inside].unique()
-    tile, region = keys // count, keys % count
+    numbers = torch.arange(rows * cols)
+    tile, region = find_windows(smooth, _corners(numbers, cols), (WINDOW, WINDOW))
     mixed = torch.bincount(tile)[tile] > 1
-    windows = cut_memberships(membership, tile[mixed], cols, region[mixed])
+    windows = read_memberships(smooth, tile[mixed], cols, region[mixed])
     positive = windows.flatten(1).amax(1) > 0
     present = ~mixed
     present[mixed] = positive
-    lists = region[present].split(torch.bincount(tile[present]).tolist())
-    numbers, counts = tile[mixed][positive].unique_consecutive(return_counts=True)
-    parts = zip(numbers.tolist(), windows[positive].split(counts.tolist()), strict=True)
-    several = {number: part for number, part in parts if len(part) > 1}
-    return Tiles(rows, cols, [part.tolist() for part in lists], several)
+    counts = torch.bincount(tile[present])
+    lists = region[present].split(counts.tolist())
+    several = set((counts > 1).nonzero().flatten().tolist())
+    return Tiles(rows, cols, [part.tolist() for part in lists], several, membership, smooth)
 
 
-def smooth_membership(regions: RegionMap) -> Membership:
-    """Return what is interpolated between the pixels of a map."""
-    return regions.tables.membership.derived("smooth", SmoothMembership)
+def _corners(tile: Tensor, cols: int) -> Tensor:
+    """Return map, first row and first column of the windows of tiles, (T, 3)."""
+    return torch.stack([torch.zeros_like(tile), tile // cols * TILE - 1, tile % cols * TILE - 1], 1)
 
 
-def cut_memberships(membership: Membership, tile: Tensor, cols: int, region: Tensor) -> Tensor:
-    """Evaluate a region over the window of a tile, (P, WINDOW, WINDOW), for P pairs of both."""
-    corners = tile // cols * TILE - 1, tile % cols * TILE - 1
-    place = torch.stack([torch.zeros_like(region), *corners], 1)
-    weights = membership.window_weights(place, region, (WINDOW, WINDOW)).cpu()
+def read_memberships(membership: Membership, tile: Tensor, cols: int, region: Tensor) -> Tensor:
+    """Read a region over the window of a tile, (P, WINDOW, WINDOW), for P pairs of both."""
+    corners = _corners(tile, cols)
+    weights = cut_windows(membership, corners, region, (WINDOW, WINDOW))
     down, across = (
         (begin[:, None] + torch.arange(WINDOW)).clamp(0, length - 1) - begin[:, None]
-        for begin, length in zip(corners, membership.index.shape[1:], strict=True)
+        for begin, length in zip(corners.unbind(1)[1:], membership.labels.shape[1:], strict=True)
     )
     return weights.gather(1, down[:, :, None].expand_as(weights)).gather(2, across[:, None, :].expand_as(weights))

@@ -12,7 +12,7 @@ from kcgs.maps import Membership
 from .graph import FLOAT, Graph, Value
 from .groups import Integers
 from .packing import pack_integers, pack_runs
-from .tiles import Tiles, cut_memberships
+from .tiles import Tiles, read_memberships
 
 # steps up to the largest weight that windows of wide contours are stored in: two bytes
 _STEPS = (1 << 16) - 1
@@ -28,7 +28,7 @@ def stored_windows(
         counts = [len(tiles.regions[tile]) for tile in ids]
         tile = torch.tensor(ids).repeat_interleave(torch.tensor(counts))
         region = torch.tensor([region for tile in ids for region in tiles.regions[tile]])
-        weights = cut_memberships(membership, tile, tiles.cols, region).numpy().swapaxes(1, 2)
+        weights = read_memberships(membership, tile, tiles.cols, region).numpy().swapaxes(1, 2)
         windows = np.zeros((len(ids), count, *weights.shape[1:]))
         windows[np.arange(count) < np.array(counts)[:, None]] = weights
         step = max(float(windows.max()), 1e-9) / _STEPS

@@ -12,6 +12,7 @@ from kcgs.kernels import SplatInputs, reference
 from kcgs.kernels.coarse_grids import choose_levels, coarsen, grids_of, max_spacing
 from kcgs.kernels.cpu import kernel as cpu
 from kcgs.maps import Membership
+from kcgs.maps.widths import blurs_of
 
 CUTOFF = 1e-4
 
@@ -30,7 +31,8 @@ def make_inputs(
         return SplatInputs(means, cholesky, colors, None, None, size, CUTOFF)
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     labels = ((x - width / 2) ** 2 + (y - height / 3) ** 2 < (height / 3) ** 2).long() + 2 * (x + y > width).long()
-    membership = Membership(torch.stack([labels.roll(5 * k, 1) for k in range(maps)]), 4, softness)
+    labels = torch.stack([labels.roll(5 * k, 1) for k in range(maps)])
+    membership = Membership(labels, torch.arange(4), blurs_of((softness,), labels.device))
     ids = torch.randint(-1, 4, (batch, n), generator=generator)
     return SplatInputs(means, cholesky, colors, ids, membership, size, CUTOFF)
 
@@ -63,7 +65,7 @@ def render_formulas(inputs: SplatInputs) -> list[Tensor]:
         total = torch.zeros(3, *inputs.size, dtype=torch.float64)
         for region in range(inputs.membership.num_regions):
             members = inputs.region_index[b] == region
-            weights = inputs.membership.weights(b % len(inputs.membership.index), region, torch.float64)
+            weights = inputs.membership.weights(b % len(inputs.membership.labels), region, torch.float64)
             total = total + weights * _render_region(*(t[members] for t in gaussians), inputs)
         images.append(total)
     image = torch.stack(images)

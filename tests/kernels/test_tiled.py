@@ -26,7 +26,8 @@ def test_float64(count: int, size: tuple[int, int], regions: int, softness: floa
     scene = random_scene(count, size, regions)
     region_map = RegionMap.from_labels(scene.labels, softness)
     got, want = (gradients(scene, region_map, cutoff=0, backend=name) for name in ("tiled", "reference"))
-    assert max(differences(got, want)) < 1e-12
+    # memberships are float32
+    assert max(differences(got, want)) < (1e-7 if softness else 1e-12)
 
 
 @pytest.mark.parametrize(("piece", "chunk"), [(1, 1), (3, 5)])

@@ -16,7 +16,8 @@ from kcgs.functional import region_splat
 from kcgs.functional.operator import splat_operator
 from kcgs.kernels import SplatInputs, cuda, reference, settle, without_waiting
 from kcgs.kernels.cuda import capacity, gather, plan, program, render
-from kcgs.maps import Membership
+from kcgs.maps import Membership, find_widths
+from kcgs.maps.widths import blurs_of
 from kcgs.optim import GaussianAdam
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -53,7 +54,8 @@ def make_inputs(
         y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
         labels = ((x > width // 2) + 2 * (y > height // 2)) % regions
         labels = torch.stack([labels.roll(3 * i, 1) for i in range(maps)]).to(DEVICE)
-        membership = Membership(labels, regions, softness)
+        widths, width_index = find_widths(labels.int(), regions, softness)
+        membership = Membership(labels, torch.arange(regions, device=DEVICE), blurs_of(widths, DEVICE), width_index)
         index = torch.randint(-1, regions, (batch, n), generator=generator).to(DEVICE)
     arrays = (t.to(DEVICE) for t in (means, cholesky, uniform(batch, n, channels) - 0.3))
     return SplatInputs(*arrays, index, membership, size, cutoff)
@@ -271,7 +273,7 @@ def test_operator() -> None:
     inputs = make_inputs(4, size=(8, 16))
     labels = (torch.arange(16, device=DEVICE) // 9).expand(8, 16).contiguous()
     ids = torch.tensor([[0, 1, 0, 1]], device=DEVICE)
-    settings = ids, labels, None, 8, 16, 0.0
+    settings = ids, labels, *[None] * 7, 8, 16, 0.0
     backward = torch.ops.kcgs.region_splat_backward.default
     grad = torch.rand(1, 3, 8, 16, device=DEVICE)
     torch.library.opcheck(splat_operator, (*inputs.gaussians, *settings, "cuda"), test_utils="test_schema")

@@ -11,7 +11,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcgs.maps import ContourWidths, Coverage, Membership, Resampled, compact, find_widths, make_coverage
+from kcgs import RegionMap
+from kcgs.maps import ContourWidths, Coverage, Membership, find_widths, make_coverage
+from kcgs.maps.widths import blurs_of, search_widths
 
 TILE = 16
 Widths = float | dict[tuple[int, int], float]
@@ -48,15 +50,19 @@ MAPS: dict[str, Tensor] = {
 
 
 def membership_of(labels: Tensor, softness: Widths) -> Membership:
-    return Membership(labels.int(), int(labels.max()) + 1, softness)
+    index, count = labels.int(), int(labels.max()) + 1
+    widths, width_index = find_widths(index, count, softness)
+    return Membership(index, torch.arange(count), blurs_of(widths, labels.device), width_index)
 
 
 @pytest.fixture(params=["torch", "compiled"])
 def coverage_of(request: pytest.FixtureRequest) -> Callable[[Membership], Coverage]:
     """The table as any device makes it, and as the CPU does."""
     if request.param == "compiled":
-        return Membership.coverage
-    return lambda membership: make_coverage(membership.index, membership.num_regions, *membership.levels)
+        return lambda membership: membership.coverage
+    return lambda membership: make_coverage(
+        membership.index, membership.num_regions, membership.widths, membership.width_index
+    )
 
 
 def tile_slices(shape: torch.Size) -> list[tuple[int, slice, slice]]:
@@ -67,7 +73,7 @@ def tile_slices(shape: torch.Size) -> list[tuple[int, slice, slice]]:
 
 def check(coverage: Coverage, membership: Membership, contours: ContourWidths | None = None) -> None:
     """Compare with regions that are looked for pixel by pixel, and with dense weights."""
-    index, (widths, width_index) = membership.index, contours or membership.levels
+    index, (widths, width_index) = membership.index, contours or (membership.widths, membership.width_index)
     oracle = [
         torch.stack([membership.weights(b, r, torch.float64) for r in range(membership.num_regions)])
         for b in range(len(index))
@@ -101,7 +107,7 @@ def test_one_width(name: str, softness: float, coverage_of: Callable[[Membership
 def test_widths_of_pairs(name: str, coverage_of: Callable[[Membership], Coverage]) -> None:
     softness = pairs(int(MAPS[name].max()) + 1, [0.7, 0.0, 2.2, 1.1])
     membership = membership_of(MAPS[name], softness)
-    assert membership.levels.level is not None
+    assert membership.width_index is not None
     check(coverage_of(membership), membership)
 
 
@@ -119,10 +125,10 @@ def test_wide_contours(
 def test_widths_of_pixels(shape: tuple[int, int, int], values: list[float]) -> None:
     """They are those of the nearest contours, ties included; beyond the reach of contours they do not matter."""
     labels = random_labels(*shape, regions=6, grain=7)
-    membership = Membership(labels.int(), 6, pairs(6, values))
-    contours = find_widths(membership.index, 6, pairs(6, values))
+    membership = membership_of(labels, pairs(6, values))
+    contours = search_widths(membership.index, 6, pairs(6, values))
     check(make_coverage(membership.index, 6, *contours), membership, contours)
-    widths, level = membership.levels
+    widths, level = membership.widths, membership.width_index
     pixels, expected = (
         torch.full(shape, w[0]) if i is None else torch.tensor(w)[i.long()] for w, i in (contours, (widths, level))
     )
@@ -134,26 +140,11 @@ def test_widths_of_pixels(shape: tuple[int, int, int], values: list[float]) -> N
     assert torch.equal(pixels[~is_far], expected[~is_far])
 
 
-@pytest.mark.parametrize("softness", [0.0, 1.5])
-def test_another_size(softness: float) -> None:
-    membership = membership_of(MAPS["batch"], softness)
-    index = torch.nn.functional.interpolate(MAPS["batch"][None].float(), (52, 40))[0].int()
-    resampled = Resampled(index, membership)
-    coverage, table = resampled.coverage(), resampled.tiles(TILE)
-    tile = torch.repeat_interleave(coverage.starts.diff())
-    assert torch.equal(tile * membership.num_regions + coverage.regions, table.keys)
-    assert torch.equal(coverage.planes.long(), table.mask_rows)
-    assert torch.equal(coverage.weights, table.masks.float())
-
-
 @pytest.mark.parametrize("softness", [0.0, 0.7, pairs(4, [0.5, 0.0, 2.0])])
 def test_devices_agree(softness: Widths, device: torch.device) -> None:
-    membership = membership_of(MAPS["batch"], softness)
-    moved = membership.to(device)
-    coverage, contours = moved.coverage(), None
-    if device.type != "cpu":
-        widths, pixels = find_widths(moved.index, moved.num_regions, softness)
-        contours = ContourWidths(widths, None if pixels is None else pixels.cpu())
+    membership, moved = (membership_of(MAPS["batch"].to(d), softness) for d in ("cpu", device))
+    coverage, pixels = moved.coverage, moved.width_index
+    contours = ContourWidths(moved.widths, None if pixels is None else pixels.cpu())
     check(Coverage(*(part.cpu() for part in coverage)), membership, contours)
 
 
@@ -165,8 +156,7 @@ def test_waits_for_the_device(softness: Widths) -> None:
         warnings.simplefilter("always")
         torch.cuda.set_sync_debug_mode("warn")
         try:
-            ids, index, _ = compact(labels)
-            Membership(index, len(ids), softness).coverage()
+            RegionMap(labels, softness)
         finally:
             torch.cuda.set_sync_debug_mode("default")
     assert len([wait for wait in waits if "synchroniz" in str(wait.message)]) <= 3

@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from kcgs.maps.nearest import spread
 from scipy import ndimage
 from torch import Tensor
 
 from kcgs import RegionMap
 from kcgs.functional import region_splat
-from kcgs.kernels.tiles import TILE
-from kcgs.maps import Membership
+from kcgs.maps import Membership, map_operands, membership_at
+from kcgs.maps.nearest import spread
 
 Widths = float | dict[tuple[int, int], float]
 PAIRS: dict[tuple[int, int], float] = {(0, 1): 0.7, (1, 2): 2.0, (0, 3): 1.1, (2, 3): 0.7}
@@ -39,21 +38,13 @@ def weights_of(membership: Membership) -> Tensor:
     return torch.stack([membership.weights(0, r, torch.float64) for r in range(membership.num_regions)])
 
 
-def from_tiles(membership: Membership, tile: int, batch: int = 0) -> Tensor:
-    """Weights of all regions of one map, put together from the tables."""
-    table = membership.tiles(tile)
-    height, width = membership.index.shape[1:]
-    rows, cols = -(-height // tile), -(-width // tile)
-    weights = torch.zeros(membership.num_regions, rows * tile, cols * tile, dtype=torch.float64)
-    for key, mask in zip(table.keys.tolist(), table.mask_rows.tolist(), strict=True):
-        place, region = divmod(key, membership.num_regions)
-        image, place = divmod(place, rows * cols)
-        if image != batch:
-            continue
-        y, x = place // cols * tile, place % cols * tile
-        mask_weights = torch.ones(tile, tile).double() if mask < 0 else table.masks[mask].double().view(tile, tile)
-        weights[region, y : y + tile, x : x + tile] = mask_weights
-    return weights[:, :height, :width]
+def membership_of(regions: RegionMap) -> Membership:
+    return membership_at(map_operands(regions))
+
+
+def from_table(membership: Membership, batch: int = 0) -> Tensor:
+    """Weights of all regions of one map, put together from the table."""
+    return torch.stack([membership.full_map(batch, region) for region in range(membership.num_regions)])
 
 
 def width_of_pixels(labels: Any, widths: dict[tuple[int, int], float]) -> Any:
@@ -92,7 +83,7 @@ def blur(labels: Tensor, sigma: Any, region: int) -> Tensor:
 class TestDefinition:
     def test_pairs(self, seed: int) -> None:
         labels = blobs(seed=seed)
-        membership = RegionMap.from_labels(labels, PAIRS).tables.membership
+        membership = membership_of(RegionMap.from_labels(labels, PAIRS))
         sigma = width_of_pixels(labels.numpy(), PAIRS)
         assert set(np.unique(sigma)) == {0.0, 0.7, 1.1, 2.0}
         for region in range(4):
@@ -101,7 +92,7 @@ class TestDefinition:
 
     def test_one_width(self, seed: int) -> None:
         labels = blobs(seed=seed)
-        membership = RegionMap.from_labels(labels, 0.9).tables.membership
+        membership = membership_of(RegionMap.from_labels(labels, 0.9))
         for region in range(4):
             expected = blur(labels, np.full(labels.shape, 0.9), region)
             assert (membership.weights(0, region, torch.float64) - expected).abs().max() < 1e-12
@@ -112,14 +103,13 @@ class TestTables:
     def test_equal_the_definition(self, softness: Widths) -> None:
         maps = torch.stack([blobs((37, 53), seed=s) for s in (0, 1)])
         maps[0, :20, :18] = 3  # tiles with a region of their own
-        membership = RegionMap.from_labels(maps, softness).tables.membership
-        for tile in (TILE, 5):
-            for batch in (0, 1):
-                dense = [membership.weights(batch, r, torch.float64) for r in range(4)]
-                assert (from_tiles(membership, tile, batch) - torch.stack(dense)).abs().max() < 1e-12
+        membership = membership_of(RegionMap.from_labels(maps, softness))
+        for batch in (0, 1):
+            dense = [membership.weights(batch, r, torch.float64) for r in range(4)]
+            assert (from_table(membership, batch) - torch.stack(dense)).abs().max() < 1e-7
 
     def test_sum_to_one(self, softness: Widths) -> None:
-        membership = RegionMap.from_labels(blobs(), softness).tables.membership
+        membership = membership_of(RegionMap.from_labels(blobs(), softness))
         weights = weights_of(membership)
         assert (weights.sum(0) - 1).abs().max() < 1e-12
         assert weights.min() >= 0
@@ -129,8 +119,8 @@ class TestTables:
 class TestPairWidths:
     def test_junction(self) -> None:
         widths = {(0, 1): 0.0, (0, 2): 0.7, (1, 2): 2.0}
-        weights = weights_of(RegionMap.from_labels(junction(), widths).tables.membership)
-        apart = {pair: weights_of(RegionMap.from_labels(junction(), w).tables.membership) for pair, w in widths.items()}
+        weights = weights_of(membership_of(RegionMap.from_labels(junction(), widths)))
+        apart = {pair: weights_of(membership_of(RegionMap.from_labels(junction(), w))) for pair, w in widths.items()}
         # far from the junction each contour is as if it were alone
         assert torch.equal(weights[:, :10, 20:40], apart[0, 1][:, :10, 20:40])
         assert (weights[:, :, :20] - apart[0, 2][:, :, :20]).abs().max() < 1e-12
@@ -139,45 +129,43 @@ class TestPairWidths:
 
     def test_hard_pair_beside_a_soft_pair(self) -> None:
         labels = (torch.arange(60) // 20).expand(20, 60)
-        weights = weights_of(RegionMap.from_labels(labels, {(1, 2): 1.5}).tables.membership)
+        weights = weights_of(membership_of(RegionMap.from_labels(labels, {(1, 2): 1.5})))
         assert torch.equal(weights[:, :, :30], torch.stack([labels == r for r in range(3)])[:, :, :30].double())
-        soft = weights_of(RegionMap.from_labels(labels, 1.5).tables.membership)
+        soft = weights_of(membership_of(RegionMap.from_labels(labels, 1.5)))
         assert torch.equal(weights[:, :, 31:], soft[:, :, 31:])
         assert (weights[2, :, 39] > 0.3).all()
 
     def test_equal_widths_of_the_contours_are_one_width(self) -> None:
         labels = (torch.arange(60) // 20).expand(20, 60)  # 0 and 2 do not touch
         regions = RegionMap.from_labels(labels, {(0, 1): 0.7, (1, 2): 0.7, (0, 2): 3.0})
-        assert regions.tables.membership.levels.widths == (0.7,)
-        table, plain = (r.tables.membership.tiles(TILE) for r in (regions, RegionMap.from_labels(labels, 0.7)))
+        assert membership_of(regions).widths == (0.7,)
+        table, plain = (membership_of(r).coverage for r in (regions, RegionMap.from_labels(labels, 0.7)))
         assert all(torch.equal(a, b) for a, b in zip(table, plain, strict=True))
 
     def test_contours_without_a_width_are_hard(self) -> None:
         labels = (torch.arange(60) // 20).expand(20, 60)
         regions = RegionMap.from_labels(labels, {(0, 2): 3.0})
-        assert regions.tables.membership.tiles(TILE).masks.dtype == torch.bool
-        assert regions.tables.membership.radius == 0
+        assert membership_of(regions).radius == 0
 
     def test_batch_with_a_map_of_one_region(self) -> None:
         maps = torch.stack([junction(), torch.ones(SIZE).long()])
-        membership = RegionMap.from_labels(maps, {(0, 1): 0.7, (1, 2): 1.0}).tables.membership
+        membership = membership_of(RegionMap.from_labels(maps, {(0, 1): 0.7, (1, 2): 1.0}))
         assert torch.equal(membership.weights(1, 1, torch.float64), torch.ones(SIZE).double())
-        assert torch.equal(from_tiles(membership, TILE, 1)[1], torch.ones(SIZE).double())
+        assert torch.equal(from_table(membership, 1)[1], torch.ones(SIZE).double())
 
     def test_only_tiles_that_see_a_contour_have_masks(self) -> None:
         labels = torch.zeros(160, 160, dtype=torch.long)
         labels[:, 80:], labels[:, 144:] = 1, 2
-        table = RegionMap.from_labels(labels, {(0, 1): 0.7}).tables.membership.tiles(TILE)
-        assert len(table.masks) == 2 * 20
+        table = membership_of(RegionMap.from_labels(labels, {(0, 1): 0.7})).coverage
+        assert len(table.weights) == 2 * 20
         # between 1 and 2 no pixel is soft, and their contour is a border of tiles
-        assert (table.mask_rows < 0).sum() == 80
+        assert (table.planes < 0).sum() == 80
 
 
 def test_to(device: torch.device) -> None:
-    membership = RegionMap.from_labels(blobs(), PAIRS).tables.membership
-    moved = membership.to(device)
-    assert moved.index.device.type == device.type
-    assert (from_tiles(moved, TILE) - from_tiles(membership, TILE)).abs().max() < 1e-12
+    regions = RegionMap.from_labels(blobs(), PAIRS)
+    moved, expected = membership_of(regions.to(device)).coverage, membership_of(regions).coverage
+    assert all(a.device.type == device.type and torch.equal(a.cpu(), b) for a, b in zip(moved, expected, strict=True))
 
 
 def test_kernels_agree_on_widths_of_pairs() -> None:

@@ -14,8 +14,8 @@ from scipy import ndimage
 from torch import Tensor
 
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
-from kcgs.functional import PairSoftness, edge_band, lookup_regions
-from kcgs.kernels.tiles import TILE
+from kcgs.functional import PairSoftness, edge_band, lookup_regions, region_splat
+from kcgs.maps import Membership, map_operands, membership_at
 from tests.tester import BaseTester
 
 
@@ -74,7 +74,8 @@ class TestRegionMap(
     @pytest.mark.parametrize(
         ("labels", "softness", "error", "words"),
         [
-            (torch.zeros(3, 3), 0.0, TypeError, "labels must have an integer dtype; got torch.float32"),
+            (torch.zeros(3, 3).cfloat(), 0.0, TypeError, "labels must have an integer dtype; got torch.complex64"),
+            (torch.zeros(2, 3, 4, 4), 0.0, ValueError, "labels must have 2 or 3 dimensions"),
             (torch.zeros(3, dtype=torch.long), 0.0, ValueError, "labels must have 2 or 3 dimensions"),
             (torch.zeros(0, 4, dtype=torch.long), 0.0, ValueError, "at least one pixel"),
             (-torch.ones(3, 3, dtype=torch.long), 0.0, ValueError, "non-negative ids; got -1"),
@@ -87,6 +88,31 @@ class TestRegionMap(
     def test_exception(self, labels: Tensor, softness: float, error: type[Exception], words: str) -> None:
         with pytest.raises(error, match=words):
             RegionMap.from_labels(labels, softness)
+
+    def test_constructor(self) -> None:
+        regions, other = RegionMap(blobs(), 0.7), RegionMap.from_labels(blobs(), 0.7)
+        assert regions.softness == other.softness and torch.equal(regions.labels, other.labels)
+        assert regions.device == torch.device("cpu") and RegionMap(labels=blobs()).softness == 0.0
+
+    def test_noise_keeps_no_table(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        regions = RegionMap(blobs(), 0.7)
+        monkeypatch.setattr("kcgs.maps.regions._MOST_PLANES", 1)
+        noise = RegionMap(blobs(), 0.7)
+        assert map_operands(regions).weights is not None and map_operands(noise).weights is None
+        field = GaussianField.random(20, (45, 70), regions=regions, seed=0)
+        for size in ((45, 70), (60, 70)):
+            assert torch.equal(Scene(field, noise).render(size), Scene(field, regions).render(size))
+        assert torch.equal(noise.membership(0), regions.membership(0))
+
+    def test_moves_all_its_tensors(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """By the methods of tensors, of which this machine may have none."""
+        regions, moved = RegionMap(blobs(), {(0, 1): 0.7}), []
+        for name in ("cuda", "pin_memory"):
+            monkeypatch.setattr(Tensor, name, lambda tensor: moved.append(tensor) or tensor.clone())
+            other = getattr(regions, name)()
+            assert other is not regions and torch.equal(other.labels, regions.labels)
+            assert other.softness == regions.softness and other.resize((9, 9)).size == (9, 9)
+        assert len(moved) == 2 * 9
 
 
 class TestPairSoftness:
@@ -119,13 +145,12 @@ class TestPairSoftness:
 
     def test_pickle_copy_and_move(self) -> None:
         regions = RegionMap.from_labels(blobs((44, 70)), {(0, 1): 0.7, (2, 3): 1.0})
-        regions.tables.membership.tiles(TILE)
         others = (pickle.loads(pickle.dumps(regions)), copy.deepcopy(regions), regions.to("meta"))
         for other in others:
             assert other.softness == regions.softness and other.resize((44, 70)) is other
             assert other.size == other.labels.shape == (44, 70) and other.index.shape == (1, 44, 70)
         assert others[2].labels.device.type == "meta"
-        assert torch.equal(others[0].tables.membership.tiles(TILE).masks, regions.tables.membership.tiles(TILE).masks)
+        assert torch.equal(membership_of(others[0]).coverage.weights, membership_of(regions).coverage.weights)
 
     @pytest.mark.parametrize(
         ("softness", "error", "words"),
@@ -145,6 +170,10 @@ class TestPairSoftness:
     def test_exception(self, softness: object, error: type[Exception], words: str) -> None:
         with pytest.raises(error, match=words):
             RegionMap.from_labels(blobs(), softness)  # type: ignore[arg-type]
+
+
+def membership_of(regions: RegionMap) -> Membership:
+    return membership_at(map_operands(regions))
 
 
 def stated_antialiasing(labels: Tensor, x: int, y: int) -> tuple[int, float]:
@@ -253,15 +282,11 @@ class TestResize:
         labels[9, 5:30], labels[20:24, 40], labels[30, 12] = 1, 2, 0
         regions = RegionMap.from_labels(labels, softness)
         resized = regions.resize(size)
-        expected = stated_membership(labels, regions.tables.membership.variances[0].sqrt(), size)
-        table, tiles_x = resized.tables.membership.tiles(16), -(-size[1] // 16)
-        found = torch.zeros(3, -(-size[0] // 16) * 16, tiles_x * 16, dtype=torch.float64)
-        for key, mask in zip(table.keys.tolist(), table.mask_rows.tolist(), strict=True):
-            y, x = key // 3 // tiles_x * 16, key // 3 % tiles_x * 16
-            found[key % 3, y : y + 16, x : x + 16] = 1.0 if mask < 0 else table.masks[mask].view(16, 16)
-        assert (found[:, : size[0], : size[1]] - expected).abs().max() < 1e-6
+        expected = stated_membership(labels, membership_of(regions).variances[0].sqrt(), size)
+        found = torch.stack([membership_of(resized).full_map(0, region) for region in range(3)])
+        assert (found - expected).abs().max() < 1e-6
         for region in range(3):
-            weights = resized.tables.membership.weights(0, region, torch.float64)
+            weights = membership_of(resized).weights(0, region, torch.float64)
             assert (weights - expected[region]).abs().max() < 1e-6
 
     @pytest.mark.parametrize("slope", [0.05, 0.09, 0.13, 0.3, 0.45])
@@ -299,7 +324,7 @@ class TestResize:
     def test_a_pixel_a_region(self) -> None:
         shares = RegionMap.from_labels(torch.arange(36).view(6, 6)).resize((24, 24))
         total = torch.stack([shares.membership(k) for k in range(36)]).sum(0)
-        assert (total - 1).abs().max() < 1e-9
+        assert (total - 1).abs().max() < 1e-6
 
     def test_renders_alike_everywhere(self, backend: str) -> None:
         regions = RegionMap.from_labels(blobs(), 0.6)
@@ -312,11 +337,11 @@ class TestResize:
     def test_copies_and_parts(self) -> None:
         regions = RegionMap.from_labels(torch.stack([blobs(seed=0), blobs(seed=1)]), 0.7)
         large = regions.resize((90, 140))
-        masks = large.tables.membership.tiles(16).masks
+        weights = membership_of(large).coverage.weights
         for other in (pickle.loads(pickle.dumps(large)), copy.deepcopy(large), RegionMap.from_state(large.state())):
-            assert torch.equal(other.tables.membership.tiles(16).masks, masks)
-        expected = large.tables.membership.weights(1, 2, torch.float64)
-        torch.testing.assert_close(large.image(1).membership(2), expected, rtol=0, atol=1e-9)
+            assert torch.equal(membership_of(other).coverage.weights, weights)
+        expected = membership_of(large).weights(1, 2, torch.float64)
+        torch.testing.assert_close(large.image(1).membership(2), expected, rtol=0, atol=1e-7)
 
     @pytest.mark.parametrize("size", [(0, 3), (3,), (2.5, 3), "ab", None])
     def test_bad_size(self, size: object) -> None:

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
 
 from kcgs.compiled.tasks import chunks, phases, run_tasks
 from kcgs.maps import Membership
 
-from ..coarse_grids import blocks_of, max_spacing
+from ..coarse_grids import make_blocks, max_spacing
 from ..interface import Gradients, SplatInputs, Steps
 from ..whitened import least_exponent, support_radius
 from .gradients import Backward
@@ -44,7 +45,7 @@ def plan(inputs: SplatInputs) -> Lists | None:
     """List which Gaussians touch which blocks; None where a value is out of range."""
     means, cholesky, colors = (_array(t) for t in inputs.gaussians)
     if inputs.membership is not None and inputs.region_index is not None:
-        table = inputs.membership.derived("cpu", lambda m: _table(m, inputs.size))
+        table = _table_of(inputs.membership)
         regions = inputs.region_index.flatten().numpy()
     else:
         table, regions = _table_without_map(inputs.size), np.empty(0, np.int64)
@@ -89,25 +90,32 @@ def _array(tensor: Tensor) -> Any:
     return tensor.detach().resolve_neg().reshape(-1, tensor.shape[-1]).contiguous().numpy()
 
 
+# of RegionMaps, by a tensor of the coverage that a table does not hold
+_tables: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
+
+
+def _table_of(membership: Membership) -> Table:
+    starts, regions, planes, weights = membership.coverage
+    table: Table | None = _tables.get(starts)
+    if table is None:
+        shape = tuple(membership.labels.shape)
+        arrays = starts.numpy(), regions.numpy(), planes.long().numpy(), weights.flatten().numpy()
+        table = _table(*arrays, membership.num_regions, shape)
+        _tables[starts] = table
+    return table
+
+
 # contour moves render each region alone, in the size of its box
 @functools.lru_cache(maxsize=256)
 def _table_without_map(size: tuple[int, int]) -> Table:
-    return _table(None, size)
+    tiles = -(-size[0] // SIDE) * -(-size[1] // SIDE)
+    starts, regions = np.arange(tiles + 1), np.zeros(tiles, np.int64)
+    return _table(starts, regions, np.full(tiles, -1), np.zeros(1, np.float32), 1, (1, *size))
 
 
-def _table(membership: Membership | None, size: tuple[int, int]) -> Table:
-    blocks = blocks_of(membership, size)
-    keys, num_regions, num_maps = blocks.keys.numpy(), 1, 1
-    mask_rows, masks = np.full(blocks.first, -1), np.zeros(1, np.float32)
-    if membership is not None:
-        num_regions, num_maps = membership.num_regions, len(membership.index)
-        tiles = membership.tiles(SIDE)
-        mask_rows, masks = tiles.mask_rows.numpy(), tiles.masks.to(torch.float32).flatten().numpy()
-    coarsest = blocks.grids[-1]
-    num_tiles = coarsest.first_tile + num_maps * coarsest.rows * coarsest.cols
-    tile_start = np.searchsorted(keys, np.arange(num_tiles + 1) * num_regions)
-    regions, parents, parity = keys % num_regions, blocks.parents.numpy(), blocks.parity.numpy()
-    return Table(num_regions, num_maps, np.array(blocks.grids), regions, tile_start, parents, parity, mask_rows, masks)
+def _table(starts: Any, regions: Any, planes: Any, masks: Any, num_regions: int, shape: tuple[int, ...]) -> Table:
+    grids, tile_start, regions, parents, parity = make_blocks(starts, regions, num_regions, shape)
+    return Table(num_regions, shape[0], np.array(grids), regions, tile_start, parents, parity, planes, masks)
 
 
 def render(lists: Lists, inputs: SplatInputs) -> Tensor:

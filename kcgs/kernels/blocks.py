@@ -1,0 +1,76 @@
+"""Loops that find the blocks of coarse grids, and which of them each block is refined from."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kcgs.compiled.program import Program, inner
+
+program = Program("coarse grids")
+
+# columns of the grids, see `coarse_grids.Grid`
+_ROWS = 2
+_COLS = 3
+_FIRST_TILE = 4
+
+
+@program.entry
+def refine(starts, regions, num_regions, maps, grids):  # type: ignore[no-untyped-def]
+    """Return the last four of `coarse_grids.Blocks` for the first two of level 0."""
+    last = grids[len(grids) - 1]
+    tile_starts = np.empty(last[_FIRST_TILE] + maps * last[_ROWS] * last[_COLS] + 1, np.int64)
+    tile_starts[: len(starts)] = starts
+    blocks, end = regions, len(regions)
+    tiles = np.full(num_regions, -1)  # the last that holds a region
+    for level in range(1, len(grids)):
+        fine, coarse = grids[level - 1], grids[level]
+        for t in range(maps * coarse[_ROWS] * coarse[_COLS]):
+            tile, first = coarse[_FIRST_TILE] + t, end
+            image, row, col = _place(t, coarse)
+            for y in range(max(2 * row - 1, 0), min(2 * row + 2, fine[_ROWS])):
+                for x in range(max(2 * col - 1, 0), min(2 * col + 2, fine[_COLS])):
+                    child = fine[_FIRST_TILE] + (image * fine[_ROWS] + y) * fine[_COLS] + x
+                    for block in range(tile_starts[child], tile_starts[child + 1]):
+                        region = blocks[block]
+                        if tiles[region] == tile:
+                            continue
+                        tiles[region] = tile
+                        if end == len(blocks):
+                            blocks = np.append(blocks, np.empty_like(blocks))
+                        k = end
+                        while k > first and blocks[k - 1] > region:
+                            blocks[k] = blocks[k - 1]
+                            k -= 1
+                        blocks[k] = region
+                        end += 1
+            tile_starts[tile + 1] = end
+    parents, parity = np.full((end, 4), end), np.zeros(end, np.uint8)
+    for level in range(len(grids)):
+        fine, coarse = grids[level], grids[min(level + 1, len(grids) - 1)]
+        for t in range(maps * fine[_ROWS] * fine[_COLS]):
+            image, row, col = _place(t, fine)
+            tile = fine[_FIRST_TILE] + t
+            for block in range(tile_starts[tile], tile_starts[tile + 1]):
+                parity[block] = 2 * (row % 2) + col % 2
+            for k in range(4 if level + 1 < len(grids) else 0):
+                y, x = (row + k // 2) // 2, (col + k % 2) // 2
+                if y < coarse[_ROWS] and x < coarse[_COLS] and row % 2 >= k // 2 and col % 2 >= k % 2:
+                    parent = coarse[_FIRST_TILE] + (image * coarse[_ROWS] + y) * coarse[_COLS] + x
+                    _find_parents(blocks, tile_starts, tile, parent, parents[:, k])
+    return tile_starts, blocks[:end], parents, parity
+
+
+@inner
+def _place(t, grid):  # type: ignore[no-untyped-def]
+    """Return map, row and column of a tile."""
+    return t // (grid[_ROWS] * grid[_COLS]), t // grid[_COLS] % grid[_ROWS], t % grid[_COLS]
+
+
+@inner
+def _find_parents(blocks, tile_starts, tile, parent, parents):  # type: ignore[no-untyped-def]
+    """Find the blocks of a tile among those of its parent, which has all their regions."""
+    place = tile_starts[parent]
+    for block in range(tile_starts[tile], tile_starts[tile + 1]):
+        while blocks[place] < blocks[block]:
+            place += 1
+        parents[block] = place

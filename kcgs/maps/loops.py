@@ -1,0 +1,311 @@
+"""Loops over label maps: which regions a tile or a window holds, and their membership there."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kcgs.compiled.program import Program, inner
+from kcgs.compiled.tasks import first_task, next_task
+
+program = Program("tables of label maps")
+
+SIDE = 16  # of a tile of `Coverage`: a number, so that the compiler makes vectors of rows
+
+
+@program.entry
+def number_regions(labels, limit, index):  # type: ignore[no-untyped-def]
+    """Fill the position of each pixel's label among the ids, which are returned; none where one is not below a limit.
+
+    Labels, (N,), and index, (N,), are flat.
+    """
+    largest = 0
+    for label in labels:
+        largest = max(largest, label)
+    if largest >= limit:
+        return np.empty(0, np.int64)
+    positions = np.full(largest + 1, -1, np.int32)
+    for label in labels:
+        positions[label] = 0
+    ids = np.flatnonzero(positions == 0)
+    for k in range(len(ids)):
+        positions[ids[k]] = k
+    for n in range(len(labels)):
+        index[n] = positions[labels[n]]
+    return ids
+
+
+@program.entry
+def list_regions(index, width_index, reaches, num_regions):  # type: ignore[no-untyped-def]
+    """Return the number of regions of each tile, (T,), and the regions, ascending, one tile after the other.
+
+    A region belongs to a tile if it has a pixel within the reach of the tile's widest contour; `reaches` are those of
+    the widths, and `width_index` is empty where there is one.
+    """
+    maps, height, width = index.shape
+    rows, cols = (height + SIDE - 1) // SIDE, (width + SIDE - 1) // SIDE
+    counts, regions = np.empty(maps * rows * cols, np.int64), np.empty(maps * rows * cols + 1, np.int32)
+    tiles = np.full(num_regions, -1)  # the last that holds a region
+    end = 0
+    for t in range(len(counts)):
+        image, top, left = t // (rows * cols), t // cols % rows * SIDE, t % cols * SIDE
+        reach = reaches[_widest(width_index[image], top, left) if len(width_index) else 0]
+        first, last = end, -1
+        left, right = max(left - reach, 0), min(left + SIDE + reach, width)
+        for y in range(max(top - reach, 0), min(top + SIDE + reach, height)):
+            for x in range(left, right):
+                region = index[image, y, x]
+                if region == last:
+                    continue
+                last = region
+                if tiles[region] == t:
+                    continue
+                tiles[region] = t
+                regions = _insert(regions, first, end, region)
+                end += 1
+        counts[t] = end - first
+    return counts, regions[:end]
+
+
+@program.entry
+def list_window_regions(starts, regions, shape, places, span, num_regions):  # type: ignore[no-untyped-def]
+    """Return the same for windows of `span` pixels at places, (T, 3): the regions of the tiles that they touch.
+
+    Args:
+        starts: of a `Coverage`.
+        regions: of it.
+        shape: maps, height and width.
+        places: map, first row and first column; rows and columns may lie beyond the image.
+        span: height and width of a window.
+        num_regions: of the map.
+    """
+    rows, cols = (shape[1] + SIDE - 1) // SIDE, (shape[2] + SIDE - 1) // SIDE
+    counts, found = np.empty(len(places), np.int64), np.empty(len(places) + 1, np.int32)
+    windows = np.full(num_regions, -1)
+    end = 0
+    for t in range(len(places)):
+        image, top, left = places[t]
+        first = end
+        for row in range(max(top // SIDE, 0), min((top + span[0] - 1) // SIDE + 1, rows)):
+            for col in range(max(left // SIDE, 0), min((left + span[1] - 1) // SIDE + 1, cols)):
+                tile = (image * rows + row) * cols + col
+                for entry in range(starts[tile], starts[tile + 1]):
+                    if windows[regions[entry]] != t:
+                        windows[regions[entry]] = t
+                        found = _insert(found, first, end, regions[entry])
+                        end += 1
+        counts[t] = end - first
+    return counts, found[:end]
+
+
+@inner
+def _insert(values, first, end, value):  # type: ignore[no-untyped-def]
+    """Insert into values[first:end], which ascend; return the array, or a larger one."""
+    if end == len(values):
+        values = np.append(values, np.empty_like(values))
+    k = end
+    while k > first and values[k - 1] > value:
+        values[k] = values[k - 1]
+        k -= 1
+    values[k] = value
+    return values
+
+
+@program.entry
+def cut_windows(starts, regions, planes, weights, shape, places, chosen, windows, tasks, counters):  # type: ignore[no-untyped-def]
+    """Fill the membership of regions, (P,), over windows, (P, h, w), at places, (P, 3), out of a `Coverage`.
+
+    `shape` is as of `list_window_regions`; membership is 0 beyond the tiles. Tasks are ranges of windows.
+    """
+    rows, cols = (shape[1] + SIDE - 1) // SIDE, (shape[2] + SIDE - 1) // SIDE
+    height, width = windows.shape[1:]
+    task = first_task(tasks, counters)
+    while task >= 0:
+        for p in range(tasks[task, 1], tasks[task, 2]):
+            image, top, left = places[p]
+            windows[p] = 0.0
+            for row in range(max(top // SIDE, 0), min((top + height - 1) // SIDE + 1, rows)):
+                for col in range(max(left // SIDE, 0), min((left + width - 1) // SIDE + 1, cols)):
+                    tile = (image * rows + row) * cols + col
+                    for entry in range(starts[tile], starts[tile + 1]):
+                        if regions[entry] == chosen[p]:
+                            _copy_plane(planes[entry], weights, row * SIDE - top, col * SIDE - left, windows[p])
+        task = next_task(tasks, counters)
+
+
+@inner
+def _copy_plane(plane, weights, top, left, window):  # type: ignore[no-untyped-def]
+    """Copy what of a tile lies in a window."""
+    height, width = window.shape
+    for y in range(max(top, 0), min(top + SIDE, height)):
+        for x in range(max(left, 0), min(left + SIDE, width)):
+            window[y, x] = weights[plane, (y - top) * SIDE + x - left] if plane >= 0 else 1.0
+
+
+@program.entry
+def fill_planes(index, smooth, width_index, taps, starts, regions, planes, weights, tasks, counters):  # type: ignore[no-untyped-def]
+    """Fill the membership of regions in the tiles of a `Coverage` that several share.
+
+    Labels are those of `index`, or, where the arrays of `smooth`, a tuple as of `SmoothLabels`, are not empty, those.
+    Row k of taps is half of the blur for pixels of width k, its centre first, then zeros; `width_index` is empty where
+    one width is for all. Tasks are ranges of tiles.
+    """
+    _, height, width = index.shape
+    rows, cols = (height + SIDE - 1) // SIDE, (width + SIDE - 1) // SIDE
+    side = SIDE + 2 * (taps.shape[1] - 1)
+    labels, others = np.empty((side, side), np.int32), np.empty((side, side), np.int32)
+    own_shares, other_shares = np.empty((side, side)), np.empty((side, side))
+    member, blurred = np.empty(side), np.empty((side, SIDE))
+    is_empty, total = np.empty(side, np.bool_), np.empty((SIDE, SIDE))
+    is_smooth = len(smooth[0]) > 0
+    task = first_task(tasks, counters)
+    while task >= 0:
+        for tile in range(tasks[task, 1], tasks[task, 2]):
+            first, end = starts[tile], starts[tile + 1]
+            if end - first < 2:
+                continue
+            image, top, left = tile // (rows * cols), tile // cols % rows * SIDE, tile % cols * SIDE
+            if side == SIDE:
+                _read(index[image], top, left, side, -1, labels)
+                for entry in range(first, end):
+                    _mark_members(labels.ravel(), regions[entry], weights[planes[entry]])
+                continue
+            for k in range(len(taps)):
+                if len(width_index) and not _has_width(width_index[image], k, top, left):
+                    continue
+                half = taps[k, : np.count_nonzero(taps[k])]
+                n = len(half) - 1
+                down, across = _sum_inside(half, top, height), _sum_inside(half, left, width)
+                _read(index[image], top - n, left - n, SIDE + 2 * n, -1, labels)
+                if is_smooth:
+                    _read(smooth[0][image], top - n, left - n, SIDE + 2 * n, 0, own_shares)
+                    _read(smooth[1][image], top - n, left - n, SIDE + 2 * n, -1, others)
+                    _read(smooth[2][image], top - n, left - n, SIDE + 2 * n, 0, other_shares)
+                for entry in range(first, end):
+                    for y in range(SIDE + 2 * n):
+                        if is_smooth:
+                            _share(labels[y], own_shares[y], others[y], other_shares[y], regions[entry], member)
+                            count = np.count_nonzero(member)
+                        else:
+                            count = _find_members(labels[y], regions[entry], member)
+                        is_empty[y] = count == 0
+                        if count > 0:
+                            _blur(half, member, blurred[y])
+                    _blur_rows(half, blurred, is_empty, total)
+                    _divide(total, down, across)
+                    _copy_pixels(total, width_index, k, (image, top, left), weights[planes[entry]])
+        task = next_task(tasks, counters)
+
+
+@inner
+def _read(image, top, left, side, outside, square):  # type: ignore[no-untyped-def]
+    """Read a square of an image, with a value beyond it."""
+    first, end = max(-left, 0), min(side, image.shape[1] - left)
+    for y in range(side):
+        square[y] = outside
+        if 0 <= top + y < image.shape[0]:
+            square[y, first:end] = image[top + y, left + first : left + end]
+
+
+@inner
+def _mark_members(labels, region, weights):  # type: ignore[no-untyped-def]
+    """Fill the weights of a tile with hard contours."""
+    for k in range(SIDE * SIDE):
+        weights[k] = labels[k] == region
+
+
+@inner
+def _find_members(labels, region, member):  # type: ignore[no-untyped-def]
+    """Mark the pixels of a line that are of a region; return their number."""
+    count = 0
+    for x in range(len(member)):
+        member[x] = labels[x] == region
+        count += labels[x] == region
+    return count
+
+
+@inner
+def _share(labels, own_shares, others, other_shares, region, member):  # type: ignore[no-untyped-def]
+    """Fill how much of each pixel of a line is of a region."""
+    for x in range(len(member)):
+        other = other_shares[x] if others[x] == region else 0.0
+        member[x] = own_shares[x] if labels[x] == region else other
+
+
+@inner
+def _blur(half, line, blurred):  # type: ignore[no-untyped-def]
+    """Blur a line to the pixels of a tile."""
+    n = len(half) - 1
+    for x in range(SIDE):
+        blurred[x] = 0.0
+    for t in range(2 * n + 1):
+        tap = half[abs(t - n)]
+        for x in range(SIDE):
+            blurred[x] += tap * line[x + t]
+
+
+@inner
+def _blur_rows(half, rows, is_empty, blurred):  # type: ignore[no-untyped-def]
+    """Blur the rows of a tile's window to those of the tile."""
+    n = len(half) - 1
+    for y in range(SIDE):
+        total = blurred[y]
+        for x in range(SIDE):
+            total[x] = 0.0
+        for t in range(2 * n + 1):
+            if not is_empty[y + t]:
+                tap, row = half[abs(t - n)], rows[y + t]
+                for x in range(SIDE):
+                    total[x] += tap * row[x]
+
+
+@inner
+def _divide(total, down, across):  # type: ignore[no-untyped-def]
+    for y in range(SIDE):
+        for x in range(SIDE):
+            total[y, x] /= max(down[y] * across[x], 1e-300)
+
+
+@inner
+def _copy_pixels(total, width_index, k, place, weights):  # type: ignore[no-untyped-def]
+    """Copy the pixels of a width; where there is one, all."""
+    image, top, left = place
+    for y in range(SIDE):
+        for x in range(SIDE):
+            if not len(width_index) or _width(width_index[image], top + y, left + x) == k:
+                weights[y * SIDE + x] = total[y, x]
+
+
+@inner
+def _sum_inside(half, first, length):  # type: ignore[no-untyped-def]
+    """Sum the taps that lie inside of an axis, around each pixel of a tile."""
+    line = np.zeros(SIDE + 2 * len(half) - 2)
+    begin = len(half) - 1 - first
+    line[max(begin, 0) : max(begin + length, 0)] = 1.0
+    sums = np.empty(SIDE)
+    _blur(half, line, sums)
+    return sums
+
+
+@inner
+def _width(width_index, row, col):  # type: ignore[no-untyped-def]
+    """Return the width of a pixel; beyond the image the border repeats."""
+    return width_index[min(max(row, 0), width_index.shape[0] - 1), min(max(col, 0), width_index.shape[1] - 1)]
+
+
+@inner
+def _has_width(width_index, k, top, left):  # type: ignore[no-untyped-def]
+    for y in range(top, top + SIDE):
+        for x in range(left, left + SIDE):
+            if _width(width_index, y, x) == k:
+                return True
+    return False
+
+
+@inner
+def _widest(width_index, top, left):  # type: ignore[no-untyped-def]
+    """Return the largest width of a tile."""
+    widest = 0
+    for y in range(top, min(top + SIDE, width_index.shape[0])):
+        for x in range(left, min(left + SIDE, width_index.shape[1])):
+            widest = max(widest, width_index[y, x])
+    return widest
