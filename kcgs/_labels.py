@@ -38,20 +38,26 @@ def is_label_source(value: object) -> bool:
 def check_labels(name: str, value: object, dims: Sequence[int] = (2, 3), values: bool = True) -> Tensor:
     """Return a label map as int64; `values`: and no id is negative.
 
-    A map is a tensor or a numpy array of integers or bool, a PIL image, or a path: see `kcgs.data.load_labels`.
+    A map is a tensor or a numpy array, a PIL image, or a path: see `kcgs.data.load_labels`. Arrays are of integers or
+    bool, or as Kornia's augmentations return them, floating and (B, 1, H, W), which is returned without the 1.
     """
     if isinstance(value, Tensor):
-        value = value.long() if value.dtype == torch.bool else value
+        value = _from_tensor(name, value)
     elif isinstance(value, np.ndarray):
         if values:
             _warn_of_antialiasing(value, f"np.asarray({name})")
-        value = _from_array(name, value, values)
+        if value.dtype.kind == "f":
+            value = _from_tensor(name, torch.from_numpy(np.array(value, np.float64)))
+        else:
+            value = _from_array(name, value, values)
     elif isinstance(value, str | os.PathLike):
         value = read_labels(value)
     elif is_pil(value):
         value = _from_pil(name, value)
     else:
         raise InvalidArgumentType(name, "a Tensor, a numpy array, a PIL image or a path", type(value).__name__)
+    if value.ndim == 4 and value.shape[1] == 1:
+        value = value[:, 0]
     tensor = check_integer(name, value, dims=dims)
     if tensor.numel() == 0:
         raise InvalidArgument(name, "at least one pixel", f"shape {tuple(tensor.shape)}", verb="have")
@@ -59,6 +65,16 @@ def check_labels(name: str, value: object, dims: Sequence[int] = (2, 3), values:
     if values and not verify(tensor.min() >= 0, f"{name} must hold non-negative ids"):
         raise InvalidArgument(name, "non-negative ids", int(tensor.min()), verb="hold")
     return tensor
+
+
+def _from_tensor(name: str, value: Tensor) -> Tensor:
+    """Return integers as they are, and bool or floating whole numbers as int64."""
+    if not value.is_floating_point():
+        return value.long() if value.dtype == torch.bool else value
+    is_whole = value.detach() % 1 == 0  # neither NaN nor infinite
+    if not verify(is_whole.all(), f"{name} must hold whole numbers"):
+        raise InvalidArgument(name, "whole numbers", float(value[~is_whole][0]), verb="hold")
+    return value.long()
 
 
 def read_labels(path: str | os.PathLike[str], rgb_ids: bool = False) -> Tensor:

@@ -47,8 +47,9 @@ class RegionMap:
         r"""Make a map of labels.
 
         Args:
-            labels: integer or bool, a Tensor or a numpy array, :math:`(H, W)` or :math:`(B, H, W)`, non-negative; ids
-                need not be consecutive. Or a PIL image, or the path of a file that :func:`kcgs.data.load_labels` reads.
+            labels: integer or bool, or floating with whole numbers, a Tensor or a numpy array, :math:`(H, W)`,
+                :math:`(B, H, W)` or :math:`(B, 1, H, W)`, non-negative; ids need not be consecutive. Or a PIL image, or
+                the path of a file that :func:`kcgs.data.load_labels` reads.
             softness: of contours (standard deviation) in pixels, 0 to 64; or one for each pair of ids in any order, 0
                 for pairs that are not mentioned.
 

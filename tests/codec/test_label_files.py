@@ -132,7 +132,7 @@ class TestEncodeLabels:
     @pytest.mark.parametrize(
         ("labels", "error", "match"),
         [
-            (torch.zeros(3, 3), TypeError, "labels must have an integer dtype"),
+            (torch.full((3, 3), 0.5), ValueError, "labels must hold whole numbers; got 0.5"),
             ([[1]], TypeError, "a PIL image or a path; got list"),
             (torch.zeros(1, 3, 3).long(), ValueError, "labels must have 2 dimensions"),
             (torch.zeros(0, 3).long(), ValueError, "labels must have at least one pixel"),

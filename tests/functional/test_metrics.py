@@ -223,7 +223,7 @@ class TestEdgeFocused(BaseTester, without={"test_module": "metrics are functions
     @pytest.mark.parametrize(
         ("labels", "width", "error", "words"),
         [
-            (torch.zeros(16, 20), 5, TypeError, "labels must have an integer dtype"),
+            (torch.full((16, 20), 0.5), 5, ValueError, "labels must hold whole numbers; got 0.5"),
             ([[0]], 5, TypeError, "labels must be a Tensor"),
             (disc_labels(20, 16), 5, ValueError, r"labels must have shape \(16, 20\) or \(2, 16, 20\)"),
             (disc_labels(16, 20).expand(3, 16, 20), 5, ValueError, "labels must have shape"),

@@ -117,7 +117,7 @@ class TestRegionSplat(BaseTester):
             ({"region_ids": torch.tensor([0.0, 1.0])}, TypeError, "region_ids must have an integer dtype"),
             ({"region_ids": torch.tensor([0, -1])}, ValueError, "region_ids must be non-negative; got -1"),
             ({"region_ids": torch.tensor([0])}, ValueError, r"region_ids must have shape \(2,\); got \(1,\)"),
-            ({"regions": torch.tensor([[0.0, 1.0]])}, TypeError, "regions must have an integer dtype"),
+            ({"regions": torch.tensor([[0.0, 1.5]])}, ValueError, "regions must hold whole numbers; got 1.5"),
             ({"regions": torch.tensor([[0, -1]])}, ValueError, "regions must hold non-negative ids; got -1"),
             ({"regions": torch.zeros(0, 3).long()}, ValueError, "regions must have at least one pixel"),
             ({"regions": torch.zeros(2, 3, 3).long()}, ValueError, "regions must hold 1 map"),

@@ -75,6 +75,9 @@ class TestRegionMap(
         ("labels", "softness", "error", "words"),
         [
             (torch.zeros(3, 3).cfloat(), 0.0, TypeError, "labels must have an integer dtype; got torch.complex64"),
+            (torch.tensor([[1.0, 2.25]]), 0.0, ValueError, "labels must hold whole numbers; got 2.25"),
+            (torch.tensor([[1.0, math.nan]]), 0.0, ValueError, "labels must hold whole numbers; got nan"),
+            (torch.tensor([[1.0, math.inf]]), 0.0, ValueError, "labels must hold whole numbers; got inf"),
             (torch.zeros(2, 3, 4, 4), 0.0, ValueError, "labels must have 2 or 3 dimensions"),
             (torch.zeros(3, dtype=torch.long), 0.0, ValueError, "labels must have 2 or 3 dimensions"),
             (torch.zeros(0, 4, dtype=torch.long), 0.0, ValueError, "at least one pixel"),
@@ -93,6 +96,21 @@ class TestRegionMap(
         regions, other = RegionMap(blobs(), 0.7), RegionMap.from_labels(blobs(), 0.7)
         assert regions.softness == other.softness and torch.equal(regions.labels, other.labels)
         assert regions.device == torch.device("cpu") and RegionMap(labels=blobs()).softness == 0.0
+
+    @pytest.mark.parametrize("kind", [torch.Tensor, np.ndarray])
+    @pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64, torch.int64])
+    def test_labels_of_augmentations(self, kind: type, dtype: torch.dtype) -> None:
+        """Kornia returns masks as floating (B, 1, H, W); a map is the same, and all else that takes labels."""
+        labels = torch.stack([blobs(seed=k) for k in (0, 1)])
+        mask = labels[:, None].to(dtype)
+        regions = RegionMap(mask if kind is torch.Tensor else mask.numpy())
+        assert torch.equal(regions.labels, labels)
+        assert torch.equal(edge_band(mask), edge_band(labels))
+        field = GaussianField.random(20, (45, 70), regions=labels[0], seed=0)
+        tensors = [t.detach().expand(2, *t.shape) for t in (field.means, field.cholesky, field.colors)]
+        ids = lookup_regions(tensors[0], mask)
+        assert torch.equal(ids, lookup_regions(tensors[0], labels))
+        assert torch.equal(region_splat(*tensors, ids, mask), region_splat(*tensors, ids, labels))
 
     def test_noise_keeps_no_table(self, monkeypatch: pytest.MonkeyPatch) -> None:
         regions = RegionMap(blobs(), 0.7)

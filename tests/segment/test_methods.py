@@ -102,7 +102,7 @@ class TestRegistry:
         ("result", "error", "message"),
         [
             (torch.full((4, 4), -1), ValueError, "labels must hold non-negative ids"),
-            (torch.zeros(4, 4), TypeError, "labels must have an integer dtype"),
+            (torch.full((4, 4), 0.5), ValueError, "labels must hold whole numbers; got 0.5"),
             (torch.zeros(2, 2).long(), ValueError, "labels must have the image's size"),
             (Prediction(np.ones((4, 4), int), np.ones(3)), ValueError, "scores must have the image's size"),
             (Prediction(np.ones((4, 4), int), names=["sky"]), ValueError, "names must have one for label 1"),
