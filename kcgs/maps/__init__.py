@@ -1,6 +1,7 @@
 """Label maps: `RegionMap`, labels and softness, and the table of a map that kernels and decoders read."""
 
 from .antialiasing import antialias, shifted
+from .arguments import as_region_map, map_operands
 from .coverage import TILE, Coverage, make_coverage
 from .labels import (
     compact,
@@ -14,42 +15,15 @@ from .labels import (
 )
 from .membership import Membership
 from .operands import MapOperands, membership_at
-from .regions import RegionMap, as_region_map, map_operands, wrap_labels
+from .regions import RegionMap, wrap_labels
 from .resampled import LEAST_BLUR, PIXEL, Resampled, SmoothMembership, cut_windows, find_windows, sharpness
 from .softness import MAX_SOFTNESS, PairSoftness
 from .widths import RADIUS_SIGMAS, ContourWidths, find_widths
 
 __all__ = [
-    "LEAST_BLUR",
-    "MAX_SOFTNESS",
-    "PIXEL",
-    "RADIUS_SIGMAS",
-    "TILE",
-    "ContourWidths",
-    "Coverage",
-    "MapOperands",
-    "Membership",
-    "PairSoftness",
-    "RegionMap",
-    "Resampled",
-    "SmoothMembership",
-    "antialias",
-    "as_region_map",
-    "compact",
-    "contour_edges",
-    "cut_windows",
-    "edge_band",
-    "find_widths",
-    "find_windows",
-    "lookup_regions",
-    "make_coverage",
-    "map_operands",
-    "membership_at",
-    "pixels_under",
-    "positions_of",
-    "sharpness",
-    "shifted",
-    "touching_pairs",
-    "unique_pairs",
-    "wrap_labels",
+    "LEAST_BLUR", "MAX_SOFTNESS", "PIXEL", "RADIUS_SIGMAS", "TILE", "ContourWidths", "Coverage", "MapOperands",
+    "Membership", "PairSoftness", "RegionMap", "Resampled", "SmoothMembership", "antialias", "as_region_map", "compact",
+    "contour_edges", "cut_windows", "edge_band", "find_widths", "find_windows", "lookup_regions", "make_coverage",
+    "map_operands", "membership_at", "pixels_under", "positions_of", "sharpness", "shifted", "touching_pairs",
+    "unique_pairs", "wrap_labels",
 ]  # fmt: skip

@@ -79,7 +79,7 @@ def list_window_regions(starts, regions, shape, places, span, num_regions):  # t
         num_regions: of the map.
     """
     rows, cols = (shape[1] + SIDE - 1) // SIDE, (shape[2] + SIDE - 1) // SIDE
-    counts, found = np.empty(len(places), np.int64), np.empty(len(places) + 1, np.int32)
+    counts, entries = np.empty(len(places), np.int64), np.empty(len(places) + 1, np.int32)
     windows = np.full(num_regions, -1)
     end = 0
     for t in range(len(places)):
@@ -91,10 +91,10 @@ def list_window_regions(starts, regions, shape, places, span, num_regions):  # t
                 for entry in range(starts[tile], starts[tile + 1]):
                     if windows[regions[entry]] != t:
                         windows[regions[entry]] = t
-                        found = _insert(found, first, end, regions[entry])
+                        entries = _insert(entries, first, end, regions[entry])
                         end += 1
         counts[t] = end - first
-    return counts, found[:end]
+    return counts, entries[:end]
 
 
 @inner
@@ -111,7 +111,7 @@ def _insert(values, first, end, value):  # type: ignore[no-untyped-def]
 
 
 @program.entry
-def cut_windows(starts, regions, planes, weights, shape, places, chosen, windows, tasks, counters):  # type: ignore[no-untyped-def]
+def cut_windows(starts, regions, planes, weights, shape, places, members, windows, tasks, counters):  # type: ignore[no-untyped-def]
     """Fill the membership of regions, (P,), over windows, (P, h, w), at places, (P, 3), out of a `Coverage`.
 
     `shape` is as of `list_window_regions`; membership is 0 beyond the tiles. Tasks are ranges of windows.
@@ -127,7 +127,7 @@ def cut_windows(starts, regions, planes, weights, shape, places, chosen, windows
                 for col in range(max(left // SIDE, 0), min((left + width - 1) // SIDE + 1, cols)):
                     tile = (image * rows + row) * cols + col
                     for entry in range(starts[tile], starts[tile + 1]):
-                        if regions[entry] == chosen[p]:
+                        if regions[entry] == members[p]:
                             _copy_plane(planes[entry], weights, row * SIDE - top, col * SIDE - left, windows[p])
         task = next_task(tasks, counters)
 

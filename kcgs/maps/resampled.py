@@ -159,8 +159,8 @@ def find_windows(membership: Membership, places: Tensor, span: Sequence[int]) ->
     starts, regions = (to_array(part) for part in membership.coverage[:2])
     shape = tuple(membership.labels.shape)
     arguments = starts, regions, shape, to_array(places), tuple(span), membership.num_regions
-    counts, found = map(torch.from_numpy, list_window_regions(*arguments))
-    return torch.repeat_interleave(counts), found.long()
+    counts, entries = map(torch.from_numpy, list_window_regions(*arguments))
+    return torch.repeat_interleave(counts), entries.long()
 
 
 def cut_windows(membership: Membership, places: Tensor, regions: Tensor, span: Sequence[int]) -> Tensor:

@@ -14,7 +14,7 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from tests.functional.test_regions import stated_weights
+from tests.maps.test_regions import stated_weights
 
 import kcgs
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene

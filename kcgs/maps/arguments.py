@@ -1,0 +1,31 @@
+"""Maps as functions take them: a RegionMap, or what it is made from."""
+
+from __future__ import annotations
+
+import numpy as np
+from torch import Tensor
+
+from kcgs._labels import check_labels, is_label_source
+
+from .operands import MapOperands
+from .regions import RegionMap
+
+
+def as_region_map(value: object, name: str = "regions") -> RegionMap | None:
+    """Return a RegionMap or None as they are, and the map with hard contours of labels; `name` is for errors."""
+    if value is None or isinstance(value, RegionMap):
+        return value
+    if is_label_source(value):
+        return RegionMap(check_labels(name, value))
+    raise TypeError(f"{name} must be a RegionMap, a label map or None; got {type(value).__name__}")
+
+
+def map_operands(regions: object) -> MapOperands:
+    """Return a map as the operator takes it, which also checks the values of labels; refuse anything else."""
+    if isinstance(regions, RegionMap):
+        return regions._operands
+    if isinstance(regions, (Tensor, np.ndarray)):  # graphs of torch 2.7 know no other form
+        labels = check_labels("regions", regions, values=False)
+        return MapOperands(labels, size=(labels.shape[-2], labels.shape[-1]))
+    hint = ": RegionMap.from_labels reads it, once for all renders" if is_label_source(regions) else ""
+    raise TypeError(f"regions must be a RegionMap, a Tensor, an array or None; got {type(regions).__name__}{hint}")
