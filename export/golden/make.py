@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
+from kcgs.maps import map_operands, membership_at
 from kcgs.onnx import scene_decoder
 
 Array = np.ndarray[Any, Any]
@@ -123,10 +124,10 @@ def make_arrays(case: Case) -> dict[str, Array]:
         arrays[name] = tensor.numpy().astype(np.min_scalar_type(int(regions.ids.max())))
     pairs = case.softness
     arrays["softness"] = np.array([(*k, v) for k, v in pairs.items()] if isinstance(pairs, Mapping) else pairs)
-    widths, level = regions.tables.membership.levels
-    if level is not None:
+    membership = membership_at(map_operands(regions))
+    if membership.width_index is not None:
         # a pixel may be equally near to several contours: other programs need not break the tie as this one does
-        arrays["contour_width"] = torch.tensor(widths)[level[0].long()].float().numpy()
+        arrays["contour_width"] = membership.variances[0].sqrt().float().numpy()
     visible = torch.ones(regions.num_regions)
     visible[case.hidden] = 0
     arrays["visible"] = visible.numpy()

@@ -75,7 +75,7 @@ class Resampled(Membership):
     def __init__(self, smooth: SmoothMembership, size: tuple[int, int]) -> None:
         """Take what is interpolated, and a size."""
         source = smooth.source
-        super().__init__(sample_labels(source.labels, *size), source.ids, source.blurs, source.width_index)
+        super().__init__(sample_labels(source.labels, *size), source.ids)
         self.source, self.smooth = source, smooth
         self.ratio = math.prod(size) / math.prod(source.labels.shape[1:])
 
@@ -143,7 +143,7 @@ class Resampled(Membership):
         is_listed = ~is_shared
         is_listed[shared] = is_present
         starts = torch.searchsorted(tile[is_listed], torch.arange(math.prod(counts) + 1), out_int32=True)
-        rows = torch.where(is_shared, is_shared.cumsum(0) - 1, -1)
+        rows = torch.full_like(tile, -1)
         rows[shared] = torch.where(is_present, is_present.cumsum(0) - 1, -1)
         weights = planes[is_present].float()
         return Coverage(starts, region[is_listed].int(), rows[is_listed].int(), weights)
