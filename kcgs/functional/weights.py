@@ -7,7 +7,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from .regions import RegionMap
+from kcgs.maps import RegionMap
+
 from .splat import squared_error_gradients
 
 

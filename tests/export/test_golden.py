@@ -14,11 +14,11 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from tests.maps.test_regions import stated_weights
 
 import kcgs
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
 from kcgs.onnx import generic_decoder, scene_decoder
+from tests.maps.test_regions import stated_weights
 
 ROOT = Path(kcgs.__file__).resolve().parent.parent
 FOLDER = ROOT / "export" / "golden"
