@@ -179,11 +179,12 @@ def compact(labels: Tensor) -> tuple[Tensor, Tensor]:
 
 def positions_of(region_ids: Tensor, ids: Tensor) -> Tensor:
     """Return the position of each id among sorted `ids`, int64, -1 where it is not one of them."""
-    if ids.device.type == "cpu" and not torch.compiler.is_compiling() and int(ids[-1]) < _TABLE_IDS:
-        # numpy takes a third of the time, and wakes no threads of torch's, which would spin beside the kernel's
-        table = np.full(int(ids[-1]) + 3, -1)  # also of ids below and beyond it
-        table[ids.numpy() + 1] = np.arange(len(ids))
-        return torch.from_numpy(table.take(region_ids.long().numpy() + 1, mode="clip"))
+    if ids.device.type == "cpu" and not torch.compiler.is_compiling():
+        from .loops import find_positions  # loads numba; and wakes no threads of torch's, which would spin beside it
+
+        positions = np.empty(region_ids.shape, np.int64)
+        find_positions(region_ids.long().contiguous().numpy().ravel(), ids.numpy(), _TABLE_IDS, positions.ravel())
+        return torch.from_numpy(positions)
     places = torch.searchsorted(ids, region_ids.contiguous()).clamp_max(len(ids) - 1)
     return torch.where(ids[places] == region_ids, places, -1)
 

@@ -35,6 +35,25 @@ def number_regions(labels, limit, index):  # type: ignore[no-untyped-def]
 
 
 @program.entry
+def find_positions(region_ids, ids, limit, positions):  # type: ignore[no-untyped-def]
+    """Fill the position of each id among sorted `ids`, -1 where it is not one of them; all are flat.
+
+    Ids below a limit are looked up in a table.
+    """
+    largest = ids[-1]
+    if largest < limit:
+        table = np.full(largest + 1, -1, np.int32)
+        for k in range(len(ids)):
+            table[ids[k]] = k
+        for n in range(len(region_ids)):
+            positions[n] = table[region_ids[n]] if 0 <= region_ids[n] <= largest else -1
+        return
+    for n in range(len(region_ids)):
+        k = np.searchsorted(ids, region_ids[n])
+        positions[n] = k if k < len(ids) and ids[k] == region_ids[n] else -1
+
+
+@program.entry
 def list_regions(index, width_index, reaches, num_regions):  # type: ignore[no-untyped-def]
     """Return the number of regions of each tile, (T,), and the regions, ascending, one tile after the other.
 
