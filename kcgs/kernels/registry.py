@@ -59,7 +59,8 @@ def _compiles(device: torch.device) -> bool:
     try:
         _try("cuda", device, torch.float32, 3)
     except Exception as error:  # whatever a compiler, a driver or a card lacks
-        if isinstance(error, torch.OutOfMemoryError) or torch.cuda.is_current_stream_capturing():
+        is_captured = torch.cuda.is_available() and torch.cuda.is_current_stream_capturing()
+        if isinstance(error, torch.OutOfMemoryError) or is_captured:
             raise  # another time it may be compiled
         warn_user(f"backend 'auto' takes 'tiled' on {device}, which is slower: {type(error).__name__}: {error}")
         return False
