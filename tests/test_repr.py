@@ -26,7 +26,7 @@ from kcgs.video import read_video
 from kcgs.zoo import entries
 
 SIZE = (64, 96)
-PRIVATE = {"kcgs.cli", "kcgs.kernels"}
+PRIVATE = {"kcgs.cli", "kcgs.compiled", "kcgs.kernels", "kcgs.maps"}
 LABELS = torch.arange(64 * 96).reshape(SIZE) // 300
 WIDTHS = {(region, region + 1): 0.3 + 0.1 * region for region in range(20)}
 

@@ -221,7 +221,7 @@ def test_sources_hold_all_that_loops_name(file: Path) -> None:
 def test_sources_that_no_loop_is_in(file: str, source: str) -> None:
     sources = program._find_sources(ROOT / file)
     assert ROOT / source in sources
-    assert all(path.is_relative_to(ROOT) for path in sources) and len(sources) < 25  # not all of kcgs, nor of others
+    assert all(path.is_relative_to(ROOT) for path in sources) and len(sources) < 40  # not all of kcgs, nor of others
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have other places")

@@ -32,7 +32,7 @@ class TestColorizeLabels:
         image = colorize_labels(torch.tensor([[0, 255, 10**12], [255, 255, 0]]))
         assert torch.equal(image, label_colors(3)[torch.tensor([[0, 1, 2], [1, 1, 0]])].permute(2, 0, 1))
 
-    @pytest.mark.parametrize("labels", [torch.zeros(2, 2), torch.tensor([[-1]])])
+    @pytest.mark.parametrize("labels", [torch.full((2, 2), 0.5), torch.tensor([[-1]])])
     def test_bad_labels(self, labels: torch.Tensor) -> None:
         with pytest.raises((TypeError, ValueError), match="labels must"):
             colorize_labels(labels)

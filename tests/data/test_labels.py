@@ -139,7 +139,11 @@ class TestSaveLabels:
                 (n, torch.from_numpy(MAP), ValueError, r"must end in \.png or \.npy; got")
                 for n in ("a", "a.jpg", "a.tif")
             ),
-            *(("a.png", wrong, TypeError, "labels must") for wrong in (MAP.astype(float), torch.zeros(2, 2), None)),
+            *(
+                ("a.png", wrong, ValueError, "labels must hold whole numbers; got 0.5")
+                for wrong in (MAP + 0.5, torch.full((2, 2), 0.5))
+            ),
+            ("a.png", None, TypeError, "labels must"),
             *(("a.png", torch.zeros(s).long(), ValueError, "labels must have") for s in ((4,), (1, 2, 2), (0, 2))),
             ("a.npy", torch.tensor([[-2]]), ValueError, "labels must hold non-negative ids; got -2"),
             *((f"no/{n}", torch.from_numpy(MAP), FileNotFoundError, "no does not exist") for n in ("a.png", "a.npy")),

@@ -137,7 +137,7 @@ class TestChooseSoftness:
             ({"image": torch.zeros(1, 3, 4, 4)}, ValueError, "image must have 3 dim"),
             ({"image": torch.zeros(3, 4, 5)}, ValueError, r"image .*\(C, 4, 4\).*\(3, 4, 5\)"),
             ({"image": torch.full((3, 4, 4), torch.nan)}, ValueError, "image must be finite"),
-            ({"labels": ONE.float()}, TypeError, "labels .* integer"),
+            ({"labels": ONE + 0.5}, ValueError, "labels must hold whole numbers"),
             ({"labels": ONE[None]}, ValueError, "labels must have 2 dim"),
             ({"labels": ONE - 1}, ValueError, "labels .* non-negative"),
             ({"candidates": ()}, ValueError, "candidates .* one or more"),

@@ -48,7 +48,7 @@ class TestMergeRegions:
         ("labels", "cost", "words"),
         [
             (torch.zeros(8, 8).long(), -1.0, "merge_cost must be finite and at least 0"),
-            (torch.zeros(8, 8), 0.1, "labels"),
+            (torch.full((8, 8), 0.5), 0.1, "labels"),
             (torch.zeros(8, 9).long(), 0.1, "labels"),
             (torch.full((8, 8), -1), 0.1, "labels"),
         ],
