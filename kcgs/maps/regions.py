@@ -194,6 +194,7 @@ class RegionMap:
             >>> regions.relabel(torch.tensor([[1, 5, 5, 2]]), "mean").softness
             PairSoftness({(1, 2): 0.7, (1, 5): 0.7})
         """
+        labels = check_labels("labels", labels)
         if labels.shape != self._labels.shape:
             raise ValueError(f"labels must have shape {tuple(self._labels.shape)}; got {tuple(labels.shape)}")
         if not self._labels.is_cpu:  # a device would be waited for at every step

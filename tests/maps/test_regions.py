@@ -78,6 +78,7 @@ class TestRegionMap(
             (torch.tensor([[1.0, 2.25]]), 0.0, ValueError, "labels must hold whole numbers; got 2.25"),
             (torch.tensor([[1.0, math.nan]]), 0.0, ValueError, "labels must hold whole numbers; got nan"),
             (torch.tensor([[1.0, math.inf]]), 0.0, ValueError, "labels must hold whole numbers; got inf"),
+            (torch.tensor([[1.0, 1e30]]), 0.0, ValueError, "labels must hold whole numbers; got 1.0"),
             (torch.zeros(2, 3, 4, 4), 0.0, ValueError, "labels must have 2 or 3 dimensions"),
             (torch.zeros(3, dtype=torch.long), 0.0, ValueError, "labels must have 2 or 3 dimensions"),
             (torch.zeros(0, 4, dtype=torch.long), 0.0, ValueError, "at least one pixel"),

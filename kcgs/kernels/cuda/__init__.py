@@ -24,13 +24,20 @@ def steps(inputs: SplatInputs) -> Steps:
     dtype, device = inputs.means.dtype, inputs.means.device
     if dtype != torch.float32:
         raise ValueError(f"backend 'cuda' computes in float32; got {dtype}: use 'tiled' or 'reference'")
+    if device.type != "cuda" and not _is_interpreted():
+        raise ValueError(f"backend 'cuda' needs tensors on a CUDA device; got {device}")
     if not _has_triton():
         raise ImportError("backend 'cuda' needs Triton: pip install triton")
     from .gather import differentiate, error_gradients
     from .plan import plan
-    from .program import is_interpreted
     from .render import render
 
-    if device.type != "cuda" and not is_interpreted():
-        raise ValueError(f"backend 'cuda' needs tensors on a CUDA device; got {device}")
     return Steps(plan, render, differentiate, None, error_gradients, checks_inputs=True, looks_up_regions=True)
+
+
+def _is_interpreted() -> bool:
+    if not _has_triton():
+        return False
+    from .program import is_interpreted
+
+    return is_interpreted()
