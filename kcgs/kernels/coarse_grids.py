@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .tiles import TILE
+from kcgs.maps import TILE
 
 # nodes along the longer side of the coarsest grid
 _COARSEST_SIDE = 2 * TILE

@@ -14,11 +14,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad, threshold
 
-from kcgs.maps import Coverage
+from kcgs.maps import TILE, Coverage
 
 from .interface import Gradients, SplatInputs, Steps, with_autograd
 from .tiles import (
-    TILE,
     TileGrid,
     bounding_tiles,
     coefficients,

@@ -7,10 +7,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcgs.maps import TILE
+
 from .interface import SplatInputs
 from .whitened import Z_LIMIT
 
-TILE = 16  # pixels along a side
 # by which bounds of a support exceed it, so that they hold for weights in float32: a share, and pixels
 RELATIVE_MARGIN = 1e-5
 MARGIN = 1e-3

@@ -12,6 +12,9 @@ from torch import Tensor
 
 from .interface import Gradients
 
+# whitened coordinates times this, squared, are an exponent of 2
+SCALE = math.sqrt(0.5 / math.log(2.0))
+
 # |z| is cut here, where every weight is zero: its square is still finite in float32
 Z_LIMIT = 1e15
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kcgs.kernels.tiles import TILE
+from kcgs.maps import TILE
 
 from .graph import FLOAT, INT64, Graph, Value
 

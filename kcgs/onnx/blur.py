@@ -10,8 +10,7 @@ import torch
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from kcgs.kernels.tiles import TILE
-from kcgs.maps import RADIUS_SIGMAS, Membership
+from kcgs.maps import RADIUS_SIGMAS, TILE, Membership
 
 from .graph import FLOAT, Graph, Value
 from .groups import Integers

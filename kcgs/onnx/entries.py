@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kcgs.kernels.tiles import TILE
 from kcgs.kernels.whitened import Z_LIMIT
+from kcgs.maps import TILE
 
 from .graph import FLOAT, Graph, Value
 from .groups import Group

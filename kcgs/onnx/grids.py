@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kcgs.kernels.tiles import TILE
+from kcgs.maps import TILE
 
 from .axis import NODES, Axis, Interpolator
 from .entries import Storage

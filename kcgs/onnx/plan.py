@@ -12,7 +12,7 @@ from torch import Tensor
 
 from kcgs.functional import RegionMap
 from kcgs.kernels.coarse_grids import Blocks, Coarsened, make_blocks
-from kcgs.kernels.tiles import TILE
+from kcgs.maps import TILE
 from kcgs.nn import GaussianField
 
 from .groups import Group, Integers, group_tiles

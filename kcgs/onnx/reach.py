@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from kcgs.kernels.coarse_grids import Blocks, Coarsened, choose_levels, coarsen, max_spacing
-from kcgs.kernels.tiles import TILE, bounding_tiles, find_keys
+from kcgs.kernels.tiles import bounding_tiles, find_keys
 from kcgs.kernels.whitened import support_radius
+from kcgs.maps import TILE
 
 # pairs of a Gaussian and a block whose distances are computed at once: 8 MB for each float64 of a pair
 _CHUNK = 1 << 20

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from kcgs.functional import RegionMap
-from kcgs.kernels.tiles import TILE
-from kcgs.maps import Membership, SmoothMembership, cut_windows, find_windows, map_operands, membership_at
+from kcgs.maps import TILE, Membership, SmoothMembership, cut_windows, find_windows, map_operands, membership_at
 
 # side of a window: a tile and the pixels around it, those of the border of the scene repeated beyond it
 WINDOW = TILE + 2

@@ -8,7 +8,8 @@ import numpy as np
 
 from kcgs.compiled.program import inner
 
-from .layout import COLOR_FACTOR, L11, L21, L22, LEVEL, SCALE
+from ..whitened import SCALE
+from .layout import COLOR_FACTOR, L11, L21, L22, LEVEL
 
 
 class Backward(NamedTuple):

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 from kcgs.compiled.program import Program
 
 program = Program("CPU kernel")
-
-# whitened coordinates times this, squared, are an exponent of 2
-SCALE = math.sqrt(0.5 / math.log(2.0))
 
 # columns of Lists.gaussians; lengths in nodes of the Gaussian's level, which at level 0 are pixels
 MEAN_X = 0

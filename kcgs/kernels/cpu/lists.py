@@ -9,7 +9,7 @@ import numpy as np
 from kcgs.compiled.program import inline, inner
 from kcgs.compiled.tasks import first_task, next_task
 
-from ..whitened import MEAN_LIMIT, SCALE_LIMITS
+from ..whitened import MEAN_LIMIT, SCALE, SCALE_LIMITS
 from .ellipse import block_rows, bounded, enter, row_halves, tile_rows
 from .layout import (
     CHANGE,
@@ -31,7 +31,6 @@ from .layout import (
     NODE_ROWS,
     PEAK,
     RUN,
-    SCALE,
     SIGMA_Y,
     SLOPE1_X,
     SLOPE2_X,

@@ -64,17 +64,20 @@ def remember(inputs: SplatInputs, slots: int) -> None:
 @contextmanager
 def room_for(inputs: SplatInputs, slots: int) -> Iterator[None]:
     """Allocate what so many slots need; a ValueError says why there are so many."""
-    count, (height, width) = inputs.colors.shape[:-1].numel(), inputs.size
-    message = (
-        f"{count} Gaussians touch {slots} tiles of 16 x 16 pixels at {height} x {width}: more than the device has room "
-        "for; they are too wide, or too many, for an image of this size"
-    )
     if slots > _MOST_SLOTS:
-        raise ValueError(message)
+        raise _too_many(inputs, slots)
     try:
         yield
     except torch.OutOfMemoryError as error:
-        raise ValueError(message) from error
+        raise _too_many(inputs, slots) from error
+
+
+def _too_many(inputs: SplatInputs, slots: int) -> ValueError:
+    count, (height, width) = inputs.colors.shape[:-1].numel(), inputs.size
+    return ValueError(
+        f"{count} Gaussians touch {slots} tiles of 16 x 16 pixels at {height} x {width}: more than the device has room "
+        "for; they are too wide, or too many, for an image of this size"
+    )
 
 
 def reports() -> bool:

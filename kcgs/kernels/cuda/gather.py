@@ -88,8 +88,8 @@ def _gather(  # type: ignore[no-untyped-def]
         color = ()
         sums = ()
         for c in tl.static_range(BLOCK):
-            known = pair < tl.where(base + c < channels, end, first)
-            color += (tl.load(colors + gaussian * channels + base + c, mask=known, other=0.0),)  # type: ignore[assignment]
+            has_color = pair < tl.where(base + c < channels, end, first)
+            color += (tl.load(colors + gaussian * channels + base + c, mask=has_color, other=0.0),)  # type: ignore[assignment]
             sums += (tl.zeros([PIECE * _PARTS], tl.float32),)  # type: ignore[assignment]
         corner = grad + ((image * channels + base) * height + top + first_row) * width + left
         for row in range(SIDE // _PARTS):

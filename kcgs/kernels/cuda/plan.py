@@ -7,7 +7,6 @@ pair. Every list is in the order of the Gaussians.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -16,9 +15,12 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from kcgs.maps import TILE
+
 from ..interface import SplatInputs
-from ..tiles import MARGIN, RELATIVE_MARGIN, TILE, TileGrid, grid_of
+from ..tiles import MARGIN, RELATIVE_MARGIN, TileGrid, grid_of
 from ..whitened import MEAN_LIMIT, SCALE_LIMITS, Z_LIMIT, support_radius
+from ..whitened import SCALE as EXPONENT_SCALE
 from .capacity import notes_of, remember, report, reports, reserve, room_for
 from .program import program
 
@@ -31,7 +33,7 @@ _MOST_TILES = (1 << 15) - 1
 # what programs read as constants
 SIDE = tl.constexpr(TILE)
 PIECE = tl.constexpr(8)  # pairs of a program of the backward
-SCALE = tl.constexpr(math.sqrt(0.5 / math.log(2.0)))  # whitened coordinates times this, squared, are an exponent of 2
+SCALE = tl.constexpr(EXPONENT_SCALE)
 _CELL = tl.constexpr(8)  # tiles along a side of a cell
 _REACH = tl.constexpr(1 + RELATIVE_MARGIN)
 _MARGIN = tl.constexpr(MARGIN)

@@ -79,9 +79,8 @@ def _render(  # type: ignore[no-untyped-def]
     for pair in tl.range(first, first + count, loop_unroll_factor=_UNROLL):
         _, _, weight = weigh(tl.load(k), tl.load(k + 1), tl.load(k + 2), tl.load(k + 3), tl.load(k + 4), x, y, cutoff)
         if MAPPED:
-            place = (
-                tl.load(slots + 2 * room + pair).to(tl.int64) * (SIDE * SIDE) + pixel
-            )  # below 0 where the region is alone
+            # below 0 where the region is alone
+            place = tl.load(slots + 2 * room + pair).to(tl.int64) * (SIDE * SIDE) + pixel
             weight *= tl.load(weights + place, mask=place >= 0, other=1.0)
         color = colors + tl.load(slots + room + pair).to(tl.int64) * channels + base
         added = ()
