@@ -5,7 +5,7 @@ Numbers in between are float64, as in `loops.py`. A Gaussian with a gradient tha
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
 
 import torch
 import triton
@@ -14,32 +14,10 @@ from torch import Tensor
 
 from kcgs.kernels.cuda.program import program
 
+from .settings import Adam, Bounds
+
 # Gaussians of a program
 _ROWS = 128
-
-
-class Adam(NamedTuple):
-    """Settings of a group, and the averages of its tables beside each other."""
-
-    lr: float | Tensor
-    beta1: float
-    beta2: float
-    eps: float
-    age: Tensor  # [N, 1]
-    average: Tensor  # [N, K]
-    square: Tensor  # [N, K]
-
-
-class Bounds(NamedTuple):
-    """Bounds of a step, in standard deviations and log scale, and of a field's geometry, in pixels."""
-
-    max_step: float
-    height: float
-    width: float
-    diagonal: float
-    min_sigma: float
-    min_factor: float
-    max_outside: float  # in standard deviations
 
 
 def step(tables: list[Tensor], gradients: list[Tensor | None], geometry: Adam, colors: Adam, bounds: Bounds) -> None:
@@ -60,7 +38,8 @@ def step(tables: list[Tensor], gradients: list[Tensor | None], geometry: Adam, c
     with torch.cuda.device_of(tables[0]):
         _step(
             (-(-count // _ROWS),),
-            *tables[:3], *opacities, *addresses[:3], *(addresses[3:] or tables[:1]), *geometry, *colors, *bounds, count,
+            *tables[:3], *opacities, *addresses[:3], *(addresses[3:] or tables[:1]), *geometry, *colors, *bounds,
+            math.hypot(bounds.height, bounds.width), count,
             CHANNELS=channels, COLUMNS=channels + len(tables[3:]), MEANS=has_gradient[0], CHOLESKY=has_gradient[1],
             COLORS=has_gradient[2], OPACITIES=has_gradient[3], LR_LOADED=isinstance(geometry.lr, Tensor),
             COLOR_LR_LOADED=isinstance(colors.lr, Tensor), ROWS=_ROWS,
@@ -119,7 +98,7 @@ def _step(  # type: ignore[no-untyped-def]
     means, cholesky, colors, opacities, means_gradient, cholesky_gradient, colors_gradient, opacities_gradient,
     lr, beta1, beta2, eps, age, average, square,
     color_lr, color_beta1, color_beta2, color_eps, color_age, color_average, color_square,
-    max_step, height, width, diagonal, min_sigma, min_factor, max_outside, count,
+    max_step, height, width, min_sigma, min_factor, max_outside, diagonal, count,
     CHANNELS: tl.constexpr, COLUMNS: tl.constexpr, MEANS: tl.constexpr, CHOLESKY: tl.constexpr, COLORS: tl.constexpr,
     OPACITIES: tl.constexpr, LR_LOADED: tl.constexpr, COLOR_LR_LOADED: tl.constexpr, ROWS: tl.constexpr,
 ):  # fmt: skip

@@ -18,6 +18,7 @@ from kcgs.kernels import takes_triton
 from kcgs.nn import GaussianField
 
 from .frame import local_gradient, move, widen
+from .settings import Adam, Bounds
 
 # steps of place in standard deviations and of log scale, and steps of colours: found on photos, and good on all images
 LEARNING_RATE = 0.14
@@ -222,7 +223,7 @@ def _step_colors(state: dict[str, Tensor], group: dict[str, Any], finite: Tensor
     if _is_compiled(*tables, *state.values()):
         from . import loops  # loads numba
 
-        loops.step_tables(tuple(_rows(*tables)), *_rows(gradient), loops.Adam(*_settings(group), *_averages(state)))
+        loops.step_tables(tuple(_rows(*tables)), *_rows(gradient), Adam(*_settings(group), *_averages(state)))
         increment_version(group["params"])
         return
     change = _adam(state, gradient, group, finite)
@@ -236,10 +237,9 @@ def _step_geometry(state: dict[str, Tensor], group: dict[str, Any], finite: Tens
     if _is_compiled(means, cholesky, *state.values()):
         from . import loops  # loads numba
 
-        limits = group["max_step"], *group["size"], group["min_sigma"], _MIN_FACTOR, _MAX_OUTSIDE
         moves = means.requires_grad, cholesky.requires_grad
-        adam, bounds = loops.Adam(*_settings(group), *_averages(state)), loops.Bounds(*map(float, limits))
-        loops.step_geometry(*_rows(means, cholesky, *gradients), moves, adam, bounds)
+        adam = Adam(*_settings(group), *_averages(state))
+        loops.step_geometry(*_rows(means, cholesky, *gradients), moves, adam, _bounds(group))
         increment_version([parameter for parameter in group["params"] if parameter.requires_grad])
         return
     step = _adam(state, local_gradient(cholesky, *gradients), group, finite)
@@ -259,13 +259,16 @@ def _launch(state: dict[Tensor, Any], geometry: dict[str, Any], colors: dict[str
         moves, averages = _has_gradient(group), state[group["params"][0]].values()
         gradients += [_gradient(p).contiguous() if moves and p.requires_grad else None for p in group["params"]]
         # where nothing moves any address will do: it is not read
-        adams.append(cuda.Adam(*_settings(group), *(averages if moves else group["params"][:1] * 3)))
-    size, min_sigma = geometry["size"], geometry["min_sigma"]
-    limits = geometry["max_step"], *size, math.hypot(*size), min_sigma, _MIN_FACTOR, _MAX_OUTSIDE
+        adams.append(Adam(*_settings(group), *(averages if moves else group["params"][:1] * 3)))
     parameters = geometry["params"] + colors["params"]
-    bounds = cuda.Bounds(*map(float, limits))
-    cuda.step(parameters, gradients, adams[0], adams[1], bounds)
+    cuda.step(parameters, gradients, adams[0], adams[1], _bounds(geometry))
     increment_version([p for p, gradient in zip(parameters, gradients, strict=True) if gradient is not None])
+
+
+def _bounds(group: dict[str, Any]) -> Bounds:
+    """Return the bounds of a step of a field's geometry."""
+    limits = group["max_step"], *group["size"], group["min_sigma"], _MIN_FACTOR, _MAX_OUTSIDE
+    return Bounds(*map(float, limits))
 
 
 def _has_gradient(group: dict[str, Any]) -> bool:

@@ -3,36 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
 
 import numpy as np
 
 from kcgs.compiled.program import Program, inner
 
 program = Program("optimizer")
-
-
-class Adam(NamedTuple):
-    """Settings of a group, and the averages of its tables beside each other, K columns."""
-
-    lr: float
-    beta1: float
-    beta2: float
-    eps: float
-    age: Any  # [N, 1]
-    average: Any  # [N, K]
-    square: Any  # [N, K]
-
-
-class Bounds(NamedTuple):
-    """Bounds of a step, in standard deviations and log scale, and of a field's geometry, in pixels."""
-
-    max_step: float
-    height: float
-    width: float
-    min_sigma: float
-    min_factor: float
-    max_outside: float  # in standard deviations
 
 
 @inner
