@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 from pathlib import Path
 
@@ -64,6 +65,14 @@ LONGEST = (
 def pytest_configure(config: pytest.Config) -> None:
     if hasattr(config.option, "loadscopereorder"):
         config.option.loadscopereorder = False  # files go to workers in the order of LONGEST
+    if importlib.util.find_spec("triton") is None:
+        config.option.ignore = [*(config.option.ignore or []), *map(str, modules_of_triton())]
+
+
+def modules_of_triton() -> list[Path]:
+    """List what cannot be imported without Triton; it has no doctests, and tests of it skip and say so."""
+    kernels = [path for path in ROOT.glob("kcgs/**/*.py") if "\nimport triton" in path.read_text(encoding="utf-8")]
+    return [*kernels, *ROOT.glob("tests/*/triton_*.py")]
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
