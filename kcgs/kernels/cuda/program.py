@@ -24,13 +24,18 @@ class Program:
 
     def __call__(self, grid: tuple[int, ...], *arguments: Any, **constants: Any) -> None:
         """Run on a grid of programs, on the device of the first argument, which is the present one."""
-        types = [a.dtype if isinstance(a, Tensor) else type(a) for a in arguments]
+        types, values = [], []
+        for argument in arguments:
+            is_tensor = isinstance(argument, Tensor)
+            types.append(argument.dtype if is_tensor else type(argument))
+            # for a tensor Triton asks the driver whether its memory is the device's
+            values.append(argument.data_ptr() if is_tensor else argument)
         key = (arguments[0].device, *constants.values(), *types)
         compiled = self._compiled.get(key)
         if compiled is None:
             self._compiled[key] = self.jit[grid](*arguments, **constants, **self.options)
         else:
-            compiled[(*grid, 1, 1)[:3]](*arguments, *[constants[name] for name in self.constants])
+            compiled[(*grid, 1, 1)[:3]](*values, *[constants[name] for name in self.constants])
 
 
 def program(warps: int) -> Callable[[Any], Program]:
