@@ -14,6 +14,8 @@ from kcgs.errors import InvalidArgument, InvalidArgumentType
 
 _FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 _INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64, torch.uint16, torch.uint32)
+# whole numbers of Python, and those that a graph leaves open
+_WHOLE = int, torch.SymInt
 
 
 def is_pil(value: object) -> bool:
@@ -148,7 +150,7 @@ def check_size(name: str, value: object) -> tuple[int, int]:
     if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 2:
         raise InvalidArgumentType(name, "a pair (height, width)", repr(value))
     # of a side that a graph leaves open, hasattr cannot be traced and operator.index would make a constant
-    plain = [isinstance(side, int | torch.SymInt) for side in value]
+    plain = [isinstance(side, _WHOLE) for side in value]
     integers = [known or hasattr(side, "__index__") for known, side in zip(plain, value, strict=True)]
     if not all(integers) or any(isinstance(side, bool) for side in value):
         raise InvalidArgumentType(name, "two integers (height, width)", repr(value), verb="hold")

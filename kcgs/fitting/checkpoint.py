@@ -26,7 +26,7 @@ from .state import FitState
 
 # a checkpoint is written when the fit has run this many times as long as the last one took to write
 _RUN_PER_WRITE = 100.0
-_VERSION = 6
+_VERSION = 7
 _DIGEST_SIZE = 32  # bytes of the SHA-256 of the content, which begins the file
 # all fields of the state that are numbers or flags
 _NUMBERS = [field.name for field in fields(FitState) if field.type in ("bool", "int", "float")]
@@ -61,7 +61,7 @@ class Checkpoint:
         digest, content = data[:_DIGEST_SIZE], data[_DIGEST_SIZE:]
         if hashlib.sha256(content).digest() != digest:
             raise ValueError(f"checkpoint {str(self.path)!r} is damaged, or no checkpoint of a fit")
-        plain = torch.load(io.BytesIO(content), weights_only=True)
+        plain = torch.load(io.BytesIO(content), self.problem.image.device, weights_only=True)
         if plain["problem"] != _fingerprint(self.problem):
             raise ValueError(
                 f"checkpoint {str(self.path)!r} belongs to another fit: image, regions, settings, num_gaussians and "

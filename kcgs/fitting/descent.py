@@ -10,10 +10,10 @@ from torch import Tensor
 
 from kcgs.functional import RegionMap, region_splat, ssim
 from kcgs.functional.splat import squared_error_gradients
-from kcgs.kernels import settle
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
+from .problem import Problem
 from .readback import Readback
 from .state import FitState
 
@@ -54,7 +54,7 @@ def backward(state: FitState, rendered: Tensor | None) -> None:
     problem, field = state.problem, state.scene.field
     config, image = problem.config, problem.image
     state.optimizer.zero_grad()
-    if rendered is None and config.loss == "l2" and problem.objective is None and problem.bounds is None:
+    if rendered is None and takes_one_pass(problem):
         field.means.grad, field.cholesky.grad, field.colors.grad = squared_error_gradients(
             image, field.means, field.cholesky, field.colors, field.region_ids, state.scene.regions,
             cutoff=state.cutoff, backend=config.backend,
@@ -74,11 +74,16 @@ def backward(state: FitState, rendered: Tensor | None) -> None:
     rendered.backward(sign)
 
 
+def takes_one_pass(problem: Problem) -> bool:
+    """True where the loss is the squared error of the render as it is."""
+    return problem.config.loss == "l2" and problem.objective is None and problem.bounds is None
+
+
 def has_diverged(state: FitState) -> bool:
     """True where a number is not finite, or near overflow; where the host runs ahead, some iterations ago.
 
     There it waits, every ten iterations, for what the device did ten iterations before: so it is never twenty ahead.
-    Where a step had gradients of NaN, since its lists did not fit, it makes room for those of the next.
+    Where a step had gradients of NaN, since its lists did not fit, the next one waits, to learn how much they take.
     """
     field = state.scene.field
     if not state.runs_ahead:
@@ -92,7 +97,7 @@ def has_diverged(state: FitState) -> bool:
         return False
     numbers, columns = previous.numbers(), sum(table.shape[1] for table in tables)
     if any(map(math.isnan, numbers[columns:])):
-        settle(state.problem.image.device, state.problem.size)
+        state.waits = True
     return not all(number < _LARGEST for number in numbers[:columns])
 
 

@@ -17,6 +17,7 @@ from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
 from kcgs.kernels import prepare, settle, without_waiting
 
+from .captured import CapturedStep, is_capturable
 from .checkpoint import Checkpoint
 from .clock import Clock
 from .config import FitConfig
@@ -143,31 +144,38 @@ def _run(
     state: FitState, clock: Clock, bar: Progress, on_step: OnStep | None, store: Checkpoint | None = None
 ) -> FitResult:
     """Take a fit from its state to its end."""
-    config = state.problem.config
+    problem, config = state.problem, state.problem.config
     limit, max_seconds = config.max_iterations, config.max_seconds or math.inf
     strategies = make_strategies(config)
     reason: StopReason = "iterations"
-    first = state.iteration
+    first, captured = state.iteration, CapturedStep()
     while state.iteration < limit:
         state.progress = max(state.iteration / limit, clock.seconds() / max_seconds)
         if has_diverged(state):
             warn_user(f"the fit diverged at iteration {state.iteration}: the best so far is kept")
             reason = "diverged"
             break
-        waits = not state.runs_ahead or state.iteration < first + _CHECKED_ITERATIONS
         for strategy in strategies:
             if strategy.due(state):
-                settle(state.problem.image.device, state.problem.size)
                 strategy.apply(state)
-                waits = True  # to learn how much room the Gaussians take now
-        with nullcontext() if waits else without_waiting():
+                state.waits = True
+        if state.waits:
+            settle(problem.image.device, problem.size)
+            captured.forget()
+        waits = state.waits or not state.runs_ahead or state.iteration < first + _CHECKED_ITERATIONS
+        replays = not waits and is_capturable(state)
+        set_learning_rates(state.optimizer, config, state.progress)
+        with nullcontext() if waits else without_waiting(), torch.set_grad_enabled(not replays):
             rendered = None
             if log_is_due(state, clock.seconds()):
                 rendered = render(state)
                 log(state, rendered, clock.seconds())
-            backward(state, rendered)
-        set_learning_rates(state.optimizer, config, state.progress)
-        state.optimizer.step()
+            if replays:
+                captured(state)
+            else:
+                backward(state, rendered)
+                state.optimizer.step()
+        state.waits = False
         state.iteration += 1
 
         take_up(state, wait=False)

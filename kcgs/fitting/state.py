@@ -56,6 +56,8 @@ class FitState:
     """Measurements whose errors are not in the history yet."""
     magnitudes: Readback | None = None
     """The largest absolute numbers of the field and its gradients some iterations ago, where the host runs ahead."""
+    waits: bool = True
+    """The next step waits for the device, to learn how much room the Gaussians take."""
     best: Scene | None = None
     """A copy of the best scene that was measured."""
     best_score: float = -math.inf

@@ -39,6 +39,8 @@ def _check(name: str, values: Tensor, valid: Tensor, expected: str, part: str = 
 
 def check_region_ids(region_ids: Tensor, index: Tensor) -> None:
     """Refuse negative ids, and warn of Gaussians whose id is not in the map: their `index`, (B, N), is negative."""
+    if not region_ids.numel():
+        return
     if int(region_ids.min()) < 0:
         raise ValueError(f"region_ids must be non-negative; got {int(region_ids.min())}")
     foreign = region_ids.view_as(index)[index < 0]

@@ -7,6 +7,7 @@ import importlib
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -15,7 +16,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from kcgs import FitConfig, fit
-from kcgs.fitting import FitResult, descent
+from kcgs.fitting import FitResult, captured, descent
 from kcgs.fitting.readback import Readback
 from kcgs.fitting.state import FitState
 from kcgs.fitting.strategies import Densify, EndDrafts, contours
@@ -113,16 +114,31 @@ def test_nothing_moves_where_a_step_had_no_room(ahead: pytest.MonkeyPatch) -> No
 
         return call
 
-    whole = run()
+    ahead.setattr(loop, "settle", lambda device, size: settled.append(size))
+    whole, num_events = run(), len(settled)
     ahead.setattr(descent, "squared_error_gradients", missed(gradients))
     ahead.setattr(loop, "render", missed(render))
-    ahead.setattr(descent, "settle", lambda device, size: settled.append(size))
     result = run()
-    assert len(calls) == ITERATIONS and 3 < len(settled) < ITERATIONS / 20 and set(settled) == {(32, 40)}
+    num_misses = len(settled) - 2 * num_events
+    assert len(calls) == ITERATIONS and 3 < num_misses < ITERATIONS / 20 and set(settled) == {(32, 40)}
     assert len(whole.history) / 2 < len(result.history) < len(whole.history)
     assert all(math.isfinite(entry.psnr) for entry in result.history)
     assert all(parameter.isfinite().all() for parameter in result.scene.field.parameters())
     assert max(e.psnr for e in result.history) > max(e.psnr for e in whole.history) - 1.5
+
+
+def test_captured_steps_are_those_that_are_not(ahead: pytest.MonkeyPatch) -> None:
+    """Between events there is one capture, except before the first event that follows the checked iterations."""
+    expected, captures, replays = run(), [], []
+
+    def record(step: Callable[[], None], previous: Any, device: torch.device) -> SimpleNamespace:
+        captures.append(step)
+        return SimpleNamespace(replay=lambda: replays.append(step()))
+
+    ahead.setattr(loop, "is_capturable", lambda state: captured.takes_one_pass(state.problem))
+    ahead.setattr(captured, "_record", record)
+    assert same(expected, run())
+    assert 3 < len(captures) < len(replays) / 4 and len(replays) > ITERATIONS / 3
 
 
 def test_divergence_ends_the_fit_within_20_iterations(ahead: pytest.MonkeyPatch) -> None:
@@ -254,11 +270,16 @@ def test_no_step_waits_for_a_gpu(monkeypatch: pytest.MonkeyPatch, has_regions: b
     for name in ("has_diverged", "take_up"):
         without_waits(loop, name, True)
     without_waits(gaussian_adam.GaussianAdam, "step", True)
+    without_waits(captured.CapturedStep, "__call__", True)
     for name in ("render", "log", "backward"):
         without_waits(loop, name, False)
     labels = (torch.arange(40) > 17).long().expand(32, 40) if has_regions else None
     results = [fit(image().cuda(), labels, 60, recipe=FitConfig(iterations=ITERATIONS)) for _ in range(2)]
-    assert calls.count("backward") == 2 * ITERATIONS
+    assert calls.count("backward") + calls.count("__call__") == 2 * ITERATIONS
+    assert calls.count("__call__") > ITERATIONS
     assert all(torch.equal(*pair) for pair in zip(*(r.scene.field.parameters() for r in results), strict=True))
+    monkeypatch.setattr(loop, "is_capturable", lambda state: False)
+    eager = fit(image().cuda(), labels, 60, recipe=FitConfig(iterations=ITERATIONS))
+    assert all(torch.equal(*pair) for pair in zip(results[0].scene.parameters(), eager.scene.parameters(), strict=True))
     on_cpu = fit(image(), labels, 60, recipe=FitConfig(iterations=ITERATIONS))
     assert max(e.psnr for e in results[0].history) > max(e.psnr for e in on_cpu.history) - 0.5

@@ -66,7 +66,7 @@ def test_compiles_without_a_gpu(
         (plan._prepare, {**map_, "NOTES": True, "BLOCK": plan._PREPARE_BLOCK}),
         (plan._bin, {"NOTES": True, "BLOCK": plan._BIN_BLOCK}),
         (plan._tile, {**map_, "BLOCK": plan._TILE_BLOCK}),
-        (render._render, {**block, **map_}),
+        (render._render, {**block, **map_, "MINUS": True}),
         (gather._gather, {**block, **map_, "GEOMETRY": True}),
         (gather._reduce, {"GEOMETRY": True, "BLOCK": gather._SLOTS, "COLUMNS": gather._COLUMNS}),
     ):

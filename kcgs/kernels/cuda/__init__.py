@@ -28,6 +28,11 @@ def steps(inputs: SplatInputs) -> Steps:
         raise ValueError(f"backend 'cuda' needs tensors on a CUDA device; got {device}")
     if not _has_triton():
         raise ImportError("backend 'cuda' needs Triton: pip install triton")
+    return _steps()
+
+
+@functools.cache
+def _steps() -> Steps:
     from .gather import differentiate, error_gradients
     from .plan import plan
     from .render import render

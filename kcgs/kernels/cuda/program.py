@@ -17,25 +17,23 @@ class Program:
         names = function.__code__.co_varnames[: function.__code__.co_argcount]
         # multiply and add in one: Triton 3.9 warns where it is not set, and 3.10 will leave it out
         self.options = {"num_warps": warps, "enable_fp_fusion": True}
-        self.constants = [n for n in names if n.isupper()]
         # no variants for integers and addresses that are multiples of 16
         self.jit = triton.jit(function, do_not_specialize=[n for n in names if not n.isupper()])
         self._compiled: dict[object, Any] = {}
 
     def __call__(self, grid: tuple[int, ...], *arguments: Any, **constants: Any) -> None:
-        """Run on a grid of programs, on the device of the first argument, which is the present one."""
-        types, values = [], []
-        for argument in arguments:
-            is_tensor = isinstance(argument, Tensor)
-            types.append(argument.dtype if is_tensor else type(argument))
-            # for a tensor Triton asks the driver whether its memory is the device's
-            values.append(argument.data_ptr() if is_tensor else argument)
-        key = (arguments[0].device, *constants.values(), *types)
+        """Run on a grid of programs, on the device of the first argument, which is the present one.
+
+        The constants say which arguments are tensors, and of which type.
+        """
+        key = arguments[0].device, *constants.values()
         compiled = self._compiled.get(key)
         if compiled is None:
             self._compiled[key] = self.jit[grid](*arguments, **constants, **self.options)
-        else:
-            compiled[(*grid, 1, 1)[:3]](*values, *[constants[name] for name in self.constants])
+            return
+        # for a tensor Triton asks the driver whether its memory is the device's
+        values = [a.data_ptr() if isinstance(a, Tensor) else a for a in arguments]
+        compiled[(*grid, 1, 1)[:3]](*values, *constants.values())
 
 
 def program(warps: int) -> Callable[[Any], Program]:

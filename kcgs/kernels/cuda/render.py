@@ -32,9 +32,9 @@ def render(plan: Plan, inputs: SplatInputs, target: Tensor | None = None) -> Ten
     block = channels_at_once(channels)
     with torch.cuda.device_of(image):
         _render(
-            (grid.total, triton.cdiv(channels, block)),
+            (grid.total, -(-channels // block)),
             image, None if target is None else target.contiguous(), inputs.colors.contiguous(), *lists_of(plan, inputs),
-            height, width, channels, BLOCK=block, MAPPED=plan.weights is not None,
+            height, width, channels, BLOCK=block, MAPPED=plan.weights is not None, MINUS=target is not None,
         )  # fmt: skip
     return image
 
@@ -63,7 +63,7 @@ def weigh(k0, k1, k2, k3, k4, x, y, cutoff):  # type: ignore[no-untyped-def]
 def _render(  # type: ignore[no-untyped-def]
     image, target, colors, counters, lists, slots, coefficients, weights,
     room, num_cells, num_tiles, rows, cols, cutoff, height, width, channels,
-    BLOCK: tl.constexpr, MAPPED: tl.constexpr,
+    BLOCK: tl.constexpr, MAPPED: tl.constexpr, MINUS: tl.constexpr,
 ):  # fmt: skip
     tile, room = tl.program_id(0), room.to(tl.int64)
     pixel = tl.arange(0, SIDE * SIDE)
@@ -96,6 +96,6 @@ def _render(  # type: ignore[no-untyped-def]
         place = ((plane + c) * height + row) * width + column
         inside = (row < tl.where(base + c < channels, height, 0)) & (column < width)
         result = value[c]  # type: ignore[var-annotated]
-        if target is not None:
+        if MINUS:
             result -= tl.load(target + place, mask=inside, other=0.0)
         tl.store(image + place, tl.where(failed, float("nan"), result), mask=inside)

@@ -1,0 +1,75 @@
+"""Steps of a fit as a CUDA graph: between events a GPU does the same again, and a replay takes the host little time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .descent import backward, takes_one_pass
+from .state import FitState
+
+
+class CapturedStep:
+    """A gradient and a step of the optimizer, captured when they are called, and replayed from then on.
+
+    A capture holds as long as an event replaces no tensor of the fit, nor its cutoff. The first call of a fit takes its
+    step without one, since programs are not compiled in a capture.
+    """
+
+    def __init__(self) -> None:
+        self._graph: Any = None
+        self._is_valid = False
+        self._rates: list[Tensor] = []
+
+    def forget(self) -> None:
+        """Capture anew at the next call."""
+        self._is_valid = False
+
+    def __call__(self, state: FitState) -> None:
+        """Take a step, with the learning rates of the moment."""
+        device, groups, is_first = state.problem.image.device, state.optimizer.param_groups, not self._rates
+        if is_first:
+            self._rates = [torch.empty((), device=device) for _ in groups]
+        elif not self._is_valid:
+            self._graph, self._is_valid = _record(lambda: self._step(state), self._graph, device), True
+        for rate, group in zip(self._rates, groups, strict=True):
+            rate.fill_(group["lr"])
+        if is_first:
+            self._step(state)
+        else:
+            self._graph.replay()
+
+    def _step(self, state: FitState) -> None:
+        """Take a step that reads the learning rates where a replay finds them."""
+        groups = state.optimizer.param_groups
+        numbers = [group["lr"] for group in groups]
+        for group, rate in zip(groups, self._rates, strict=True):
+            group["lr"] = rate
+        backward(state, None)
+        state.optimizer.step()
+        for group, number in zip(groups, numbers, strict=True):
+            group["lr"] = number
+
+
+def is_capturable(state: FitState) -> bool:
+    """Whether steps of the state are a kernel's programs alone, on a GPU."""
+    return state.runs_ahead and state.problem.image.is_cuda and takes_one_pass(state.problem)
+
+
+def _record(step: Callable[[], None], previous: Any, device: torch.device) -> Any:
+    """Capture a step, in the memory of the previous graph, which is not replayed again."""
+    with torch.cuda.device(device):
+        graph, stream, current = torch.cuda.CUDAGraph(), torch.cuda.Stream(), torch.cuda.current_stream()
+        stream.wait_stream(current)
+        with torch.cuda.stream(stream):
+            # other threads may use the device meanwhile
+            graph.capture_begin(None if previous is None else previous.pool(), "thread_local")
+            try:
+                step()
+            finally:
+                graph.capture_end()
+        current.wait_stream(stream)
+    return graph
