@@ -159,4 +159,5 @@ def test_waits_for_the_device(softness: Widths) -> None:
             RegionMap(labels, softness)
         finally:
             torch.cuda.set_sync_debug_mode("default")
-    assert len([wait for wait in waits if "synchroniz" in str(wait.message)]) <= 4
+    count = len([wait for wait in waits if "synchroniz" in str(wait.message)])
+    assert count <= (4 if isinstance(softness, float) else 6)
