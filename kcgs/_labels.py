@@ -12,20 +12,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs._check import check_integer, is_pil, verify
+from kcgs._check import check_integer, check_number, is_pil, verify
+from kcgs._image import LUMA
 from kcgs._rows import row_slices
-from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument, InvalidArgumentType
 
 MAX_COLORS = 4096
 """An image with more distinct colours is taken for a photo, not for a label map."""
 
-# In an antialiased mask the darkest and the lightest levels, each this share of the range,
+# In a mask with soft edges the darkest and the lightest levels, each this share of the range,
 _END_SHARE = 1 / 16
 # cover so much of it,
-_MIN_SHARE = 0.75
+_MIN_SHARE = 0.5
 # there are at least so many levels between them,
-_MIN_LEVELS = 16
+_MIN_LEVELS = 8
 # and so few of the pixels between have eight neighbours of their own level.
 _MAX_INTERIOR = 0.05
 
@@ -44,8 +44,8 @@ def check_labels(name: str, value: object, dims: Sequence[int] = (2, 3), values:
     if isinstance(value, Tensor):
         value = _from_tensor(name, value)
     elif isinstance(value, np.ndarray):
-        if values:
-            _warn_of_antialiasing(value, f"np.asarray({name})")
+        if values and value.ndim == 2:
+            _check_edges(name, value, f"np.asarray({name}) > {{}}")
         if value.dtype.kind == "f":
             value = _from_tensor(name, torch.from_numpy(np.array(value, np.float64)))
         else:
@@ -82,14 +82,17 @@ def _from_tensor(name: str, value: Tensor) -> Tensor:
     return value.long()
 
 
-def read_labels(path: str | os.PathLike[str], rgb_ids: bool = False) -> Tensor:
+def read_labels(path: str | os.PathLike[str], rgb_ids: bool = False, threshold: float | None = None) -> Tensor:
     """Read a label map, as `kcgs.data.load_labels` documents it."""
+    if threshold is not None:
+        check_number("threshold", threshold, 0)
+    remedy = f"load_labels({os.fspath(path)!r}, threshold={{0}}), or --threshold {{0}}"
     if Path(path).suffix.lower() == ".npy":
         try:
             values = np.asarray(np.load(path, allow_pickle=False))  # of an archive an object, which is no map
         except (ValueError, EOFError) as error:
             raise ValueError(f"cannot read {path} as an .npy array: {error}") from error
-        return _from_grey(str(path), values, f"np.load({os.fspath(path)!r})")
+        return _from_grey(str(path), values, remedy, threshold)
     from kcgs._decode import decode
 
     samples = decode(path, indices=True)
@@ -98,9 +101,9 @@ def read_labels(path: str | os.PathLike[str], rgb_ids: bool = False) -> Tensor:
             "path must be a label map in a lossless format (PNG, TIFF, GIF, BMP, .npy); "
             f"got {samples.format} at {path}, whose compression can change labels"
         )
-    if rgb_ids and samples.values.shape[-1] > 1:
+    if rgb_ids and threshold is None and samples.values.shape[-1] > 1:
         return _from_ids(samples.values, path)
-    return _from_samples(str(path), samples.values, f"np.asarray(PIL.Image.open({os.fspath(path)!r}))")
+    return _from_samples(str(path), samples.values, remedy, threshold)
 
 
 def _from_pil(name: str, image: Any) -> Tensor:
@@ -109,17 +112,34 @@ def _from_pil(name: str, image: Any) -> Tensor:
     if image.format is not None and not is_lossless(image):
         expected = "a label map from a lossless format (PNG, TIFF, GIF, BMP)"
         raise InvalidArgument(name, expected, f"{image.format}, whose compression can change labels")
-    return _from_samples(name, pil_indices(image), f"np.asarray({name})")
+    return _from_samples(name, pil_indices(image), f"np.asarray({name}.convert('L')) > {{}}")
 
 
-def _from_samples(name: str, values: NDArray[Any], expression: str) -> Tensor:
-    if values.shape[-1] > 1:
-        return _from_colors(values, name)
-    return _from_grey(name, values[..., 0], expression)
+def _from_samples(name: str, values: NDArray[Any], remedy: str, threshold: float | None = None) -> Tensor:
+    if values.shape[-1] == 1:
+        return _from_grey(name, values[..., 0], remedy, threshold)
+    luma = _luma(values)
+    if threshold is not None:
+        return torch.from_numpy(luma > threshold).long()
+    _check_edges(name, luma, remedy)
+    del luma
+    return _from_colors(values, name)
 
 
-def _from_grey(name: str, values: NDArray[Any], expression: str) -> Tensor:
-    _warn_of_antialiasing(values, expression)
+def _luma(values: NDArray[Any]) -> NDArray[Any]:
+    """Return the luma of samples (H, W, C) in their dtype, alpha left out."""
+    if values.shape[-1] == 2:
+        return values[..., 0]
+    luma = np.empty(values.shape[:2], values.dtype)
+    for rows in row_slices(*luma.shape):
+        luma[rows] = (values[rows][..., :3] @ np.array(LUMA, np.float32)).round()
+    return luma
+
+
+def _from_grey(name: str, values: NDArray[Any], remedy: str, threshold: float | None = None) -> Tensor:
+    if threshold is not None:
+        values = values > threshold
+    _check_edges(name, values, remedy)
     return check_labels(name, _from_array(name, values, True, copy=False), dims=(2,))
 
 
@@ -178,23 +198,27 @@ def _sort_distinct(numbers: NDArray[Any]) -> NDArray[Any]:
     return np.concatenate([numbers[:1], numbers[1:][numbers[1:] != numbers[:-1]]])
 
 
-def _warn_of_antialiasing(array: NDArray[Any], expression: str) -> None:
-    """Warn of grey levels between dark and light ones that occur along contours only."""
-    if array.ndim != 2 or array.size == 0 or array.dtype not in (np.uint8, np.uint16):
+def _check_edges(name: str, levels: NDArray[Any], remedy: str) -> None:
+    """Refuse grey levels between dark and light ones that occur along contours only.
+
+    Args:
+        name: of the map.
+        levels: (H, W).
+        remedy: what to pass instead, with {} for the threshold.
+    """
+    if levels.size == 0 or levels.dtype not in (np.uint8, np.uint16):
         return
-    ids = np.flatnonzero(np.bincount(array.ravel()))
+    ids = np.flatnonzero(np.bincount(levels.ravel()))
     low, high = int(ids[0]), int(ids[-1])
     darkest, lightest = low + _END_SHARE * (high - low), high - _END_SHARE * (high - low)
     if ((ids > darkest) & (ids < lightest)).sum() < _MIN_LEVELS:
         return
-    between = (array > darkest) & (array < lightest)
-    if between.sum() > (1 - _MIN_SHARE) * array.size:
+    between = (levels > darkest) & (levels < lightest)
+    if between.sum() > (1 - _MIN_SHARE) * levels.size:
         return
     from scipy.ndimage import maximum_filter, minimum_filter
 
-    interior = (minimum_filter(array, 3) == maximum_filter(array, 3)) & between
+    interior = (minimum_filter(levels, 3) == maximum_filter(levels, 3)) & between
     if interior.sum() <= _MAX_INTERIOR * between.sum():
-        warn_user(
-            f"the {len(ids)} ids of this map look like an antialiased mask of two regions: threshold it, "
-            f"{expression} > {(low + high) // 2}"
-        )
+        received = f"{len(ids)} grey levels, as a mask with soft edges has: pass {remedy.format((low + high) // 2)}"
+        raise InvalidArgument(name, "ids of regions", received, verb="hold")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import pickle
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -142,23 +141,36 @@ def test_paths_are_arguments_of_fit_and_evaluate(tmp_path: Path) -> None:
     assert segment(photo).shape == (16, 16)
 
 
-@pytest.mark.parametrize(
-    ("blur", "noise", "hint"),
-    [(0, 0, []), (1, 0, ["np.asarray(labels) > 127"]), (1, 3, ["np.asarray(labels) > 127"])],
-)
-def test_antialiased_masks_get_a_hint(blur: int, noise: int, hint: list[str]) -> None:
-    """Also the probabilities of a network, whose levels are only near to dark and light."""
+def soft_mask(blur: float, noise: int = 0) -> np.ndarray:
+    """Return a disc with soft edges, or as the probabilities of a network, which are only near to dark and light."""
     y, x = np.mgrid[:96, :96] - 48
     mask = gaussian_filter(255.0 * (np.hypot(x, y) < 30), blur)
     mask = np.abs(mask - np.random.default_rng(0).uniform(0, noise, mask.shape)).round().astype(np.uint8)
     mask[0, 0], mask[48, 48] = 0, 255
-    with warnings.catch_warnings(record=True) as messages:
-        warnings.simplefilter("always")
-        RegionMap.from_labels(mask)
-    assert [str(message.message).partition("threshold it, ")[2] for message in messages] == hint
+    return mask
 
 
-def test_many_ids_are_no_antialiased_mask() -> None:
+@pytest.mark.parametrize(("blur", "noise"), [(1, 0), (1, 3), (5, 0)])
+@pytest.mark.parametrize(
+    "convert", [np.asarray, lambda m: Image.fromarray(m), lambda m: Image.fromarray(m).convert("RGB")]
+)
+def test_masks_with_soft_edges_are_refused(blur: float, noise: int, convert: Callable[..., object]) -> None:
+    assert RegionMap.from_labels(convert(soft_mask(0))).num_regions == 2
+    with pytest.raises(InvalidArgument, match=r"soft edges has: pass np\.asarray\(labels.*\) > 127"):
+        RegionMap.from_labels(convert(soft_mask(blur, noise)))
+
+
+@pytest.mark.parametrize("mode", ["L", "LA", "RGB"])
+def test_a_threshold_makes_two_regions_of_soft_edges(mode: str, tmp_path: Path) -> None:
+    Image.fromarray(soft_mask(1)).convert(mode).save(tmp_path / "soft.png")
+    np.save(tmp_path / "soft.npy", soft_mask(1))
+    for path in (tmp_path / "soft.png", tmp_path / "soft.npy"):
+        with pytest.raises(InvalidArgument, match=r"soft\.\w+', threshold=127\), or --threshold 127"):
+            load_labels(path)
+        assert torch.equal(load_labels(path, threshold=127), torch.from_numpy(soft_mask(1) > 127).long())
+
+
+def test_many_ids_are_no_soft_edges() -> None:
     cells = np.kron(np.arange(144).reshape(12, 12), np.ones((4, 4))).astype(np.uint8)
     big = np.zeros((96, 96), np.uint8)
     big[:, 48:], big[:48, :48] = 255, cells

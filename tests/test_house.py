@@ -32,7 +32,8 @@ LAYERS = [
     {"kernels", "engine", "plots"},
     {"maps"},
     {"compiled"},
-    {"_image", "_labels"},
+    {"_labels"},
+    {"_image"},
     {"_atomic", "_check", "_decode", "_memory", "_progress", "_repr", "_suffixes", "_warn"},
     {"errors", "_rows"},
 ]

@@ -43,6 +43,7 @@ def fit_command(
         typer.Option("-o", "--output", help="Scene (.safetensors) or file (.kcgs); default: IMAGE's name, here."),
     ] = None,
     overwrite: options.Overwrite = False,
+    threshold: options.Threshold = None,
     resize_regions: options.ResizeRegions = False,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -58,7 +59,7 @@ def fit_command(
     from kcgs.data import load_image
 
     target = load_image(image)
-    labels = read_regions(regions, target, resize=resize_regions, progress=not quiet)
+    labels = read_regions(regions, target, threshold, resize=resize_regions, progress=not quiet)
     with InterruptHandler() as interrupts:
         saved_fit = fit_and_save(output, target, labels, request, on_step=interrupts.on_step, progress=not quiet)
     report, regions_report = report_fit(saved_fit, target, labels, output, request), saved_fit.result.regions
@@ -132,8 +133,12 @@ def fit_and_save(
     return SavedFit(result, scene, num_bytes, time.perf_counter() - start)
 
 
-def read_regions(regions: str, image: Tensor, *, resize: bool = False, progress: bool = False) -> Tensor | None:
+def read_regions(
+    regions: str, image: Tensor, threshold: float | None = None, *, resize: bool = False, progress: bool = False
+) -> Tensor | None:
     """Return the label map that the option --regions names, with `resize` at the size of the image."""
+    if regions in ("auto", "none"):
+        options.exclude(f"--regions {regions}", threshold=threshold)
     if regions == "none":
         return None
     if regions == "auto":
@@ -143,7 +148,7 @@ def read_regions(regions: str, image: Tensor, *, resize: bool = False, progress:
             return segment(image)
     from kcgs.data import load_labels
 
-    labels, size = load_labels(Path(regions)), (image.shape[-2], image.shape[-1])
+    labels, size = load_labels(Path(regions), threshold=threshold), (image.shape[-2], image.shape[-1])
     if tuple(labels.shape) == size:
         return labels
     if not resize:

@@ -45,6 +45,7 @@ def fit_many_command(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace files made with other settings or changed since.")
     ] = False,
+    threshold: options.Threshold = None,
     resize_regions: options.ResizeRegions = False,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -57,6 +58,8 @@ def fit_many_command(
     """
     if request.target_bytes is not None and suffix == ".safetensors":
         options.exclude("--target-bytes", suffix=suffix)
+    if regions in ("auto", "none"):
+        options.exclude(f"--regions {regions}", threshold=threshold)
     jobs = [
         FitJob(
             image,
@@ -65,6 +68,7 @@ def fit_many_command(
             request,
             overwrite,
             resize_regions,
+            threshold,
         )
         for stem, image, mask in _find_images(images, regions)
     ]

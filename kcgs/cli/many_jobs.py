@@ -27,6 +27,8 @@ class FitJob(NamedTuple):
     overwrite: bool = False
     """Replace a scene of another image, mask or settings, or one that was changed since."""
     resize_regions: bool = False
+    threshold: float | None = None
+    """Of masks with soft edges."""
 
 
 class Outcome(NamedTuple):
@@ -60,7 +62,7 @@ def fit_one(job: FitJob) -> Outcome:
         with warnings.catch_warnings(record=True) as messages:
             warnings.simplefilter("always", UserWarning)
             image = load_image(job.image)
-            labels = read_regions(job.regions, image, resize=job.resize_regions)
+            labels = read_regions(job.regions, image, job.threshold, resize=job.resize_regions)
             # a command that is killed between scene and row knows the scene as its own when it is run again
             write_file(record, json.dumps({"fingerprint": fingerprint}))
             saved_fit = fit_and_save(job.output, image, labels, job.request)
@@ -89,6 +91,10 @@ def _checksum(output: Path, row: dict[str, Any]) -> str:
 def _fingerprint(job: FitJob) -> str:
     """Hash the image, the mask and all settings."""
     request = job.request
-    settings = request.load_config().model_dump_json(), request.num_gaussians, request.target_bytes, request.seed
+    settings: tuple[Any, ...] = (
+        request.load_config().model_dump_json(), request.num_gaussians, request.target_bytes, request.seed,
+    )  # fmt: skip
+    if job.threshold is not None:
+        settings += (job.threshold,)
     mask = job.regions.encode() if job.regions in ("auto", "none") else Path(job.regions).read_bytes()
     return hashlib.sha256(b"\0".join((repr(settings).encode(), job.image.read_bytes(), mask))).hexdigest()

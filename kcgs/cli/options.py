@@ -22,6 +22,10 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files that
 ResizeRegions = Annotated[
     bool, typer.Option("--resize-regions", help="Resize a label map of another size to that of the image.")
 ]
+Threshold = Annotated[
+    float | None,
+    typer.Option(min=0, help="Of a mask with soft edges: grey level above which a pixel is of the object."),
+]
 Objective = Annotated[
     Literal["auto", "psnr", "ms-ssim"] | None,
     typer.Option(help="What to maximize; auto, the default: ms-ssim for a compressed file, else psnr."),

@@ -23,7 +23,7 @@ from .common import (
     print_report,
 )
 from .fit import describe_file, describe_scene, read_regions
-from .options import Objective, ResizeRegions, exclude, target_size
+from .options import Objective, ResizeRegions, Threshold, exclude, target_size
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -81,6 +81,7 @@ def eval_command(
             dir_okay=False,
         ),
     ] = None,
+    threshold: Threshold = None,
     resize_regions: ResizeRegions = False,
     as_json: Json = False,
 ) -> None:
@@ -90,7 +91,7 @@ def eval_command(
     from kcgs.scene import check_unbatched
 
     loaded, target = check_unbatched(load(scene)), load_image(image)
-    labels = read_regions("none" if regions is None else str(regions), target, resize=resize_regions)
+    labels = read_regions("none" if regions is None else str(regions), target, threshold, resize=resize_regions)
     report: dict[str, Any] = evaluate(loaded, target, labels)
     start = time.perf_counter()
     loaded.render()
@@ -150,6 +151,7 @@ def encode(
         ),
     ] = None,
     objective: Objective = None,
+    threshold: Threshold = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -160,10 +162,11 @@ def encode(
         from kcgs.codec import encode_labels
         from kcgs.data import load_labels
 
-        labels = load_labels(scene, rgb_ids=True)
+        labels = load_labels(scene, rgb_ids=True, threshold=threshold)
         write_file(output, encode_labels(labels))
         print_report(_describe_map(output, labels), as_json, str(output))
         return
+    exclude("a scene", threshold=threshold)
     if image is None:
         exclude("a scene without --image", objective=objective)
     from kcgs import codec, load

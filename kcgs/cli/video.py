@@ -46,6 +46,7 @@ def fit_video_command(
             "first frame), which follow the motion; or none.",
         ),
     ] = "auto",
+    threshold: options.Threshold = None,
     request: options.FitRequest,
     frame_rate: Annotated[
         float | None, typer.Option(help="Frames per second; default: the file's, of a folder 24.")
@@ -66,11 +67,12 @@ def fit_video_command(
     source = read_video(video, frame_rate=frame_rate)
     maps: Any
     if Path(regions).is_dir():
+        options.exclude("a folder of label maps", threshold=threshold)
         maps = read_label_maps(regions)
     elif regions in ("auto", "none"):
-        maps = read_regions(regions, next(iter(source)), progress=not quiet)
+        maps = read_regions(regions, next(iter(source)), threshold, progress=not quiet)
     else:
-        maps = load_labels(regions, rgb_ids=True)
+        maps = load_labels(regions, rgb_ids=True, threshold=threshold)
     start = time.perf_counter()
     with InterruptHandler() as interrupts:
         scenes = fit_video(

@@ -13,7 +13,7 @@ from kcgs._labels import check_labels, read_labels
 from kcgs.data.colors import label_colors
 
 
-def load_labels(path: str | os.PathLike[str], *, rgb_ids: bool = False) -> Tensor:
+def load_labels(path: str | os.PathLike[str], *, rgb_ids: bool = False, threshold: float | None = None) -> Tensor:
     """Read a label map.
 
     The kind of file decides what a label is:
@@ -27,6 +27,8 @@ def load_labels(path: str | os.PathLike[str], *, rgb_ids: bool = False) -> Tenso
     Args:
         path: PNG, TIFF, GIF, BMP or .npy, no format that changes pixel values.
         rgb_ids: colours are ids, R + 256 G + 65536 B, as in COCO's panoptic maps; any number of them.
+        threshold: of a mask with soft edges: pixels with larger values have label 1, others 0; of colours the luma
+            counts.
 
     Returns:
         :math:`(H, W)` int64, non-negative; ids need not be consecutive.
@@ -34,11 +36,8 @@ def load_labels(path: str | os.PathLike[str], *, rgb_ids: bool = False) -> Tenso
     Raises:
         OSError: ``path`` does not exist, or is a folder.
         TypeError: the file holds floats.
-        ValueError: the file cannot be read, is lossy or a photo (more than 4,096 colours), or holds negative values or
-            another number of dimensions.
-
-    Warns:
-        UserWarning: a grey file looks like an antialiased mask; the warning has the line that thresholds it.
+        ValueError: the file cannot be read, is lossy or a photo (more than 4,096 colours), holds negative values or
+            another number of dimensions, or is a mask with soft edges; the message then has a ``threshold`` for it.
 
     Example:
         >>> import tempfile
@@ -47,7 +46,7 @@ def load_labels(path: str | os.PathLike[str], *, rgb_ids: bool = False) -> Tenso
         ...     load_labels(f"{folder}/map.png").tolist()
         [[0, 0, 7], [3, 3, 7]]
     """
-    return read_labels(path, rgb_ids)
+    return read_labels(path, rgb_ids, threshold)
 
 
 def save_labels(path: str | os.PathLike[str], labels: Tensor, *, rgb_ids: bool = False) -> None:

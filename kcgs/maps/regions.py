@@ -54,10 +54,8 @@ class RegionMap:
 
         Raises:
             TypeError: labels are no integers; softness of another type.
-            ValueError: wrong shape, no pixels, negative ids, softness out of range or of ids that are not in the map.
-
-        Warns:
-            UserWarning: a grey image or array looks like an antialiased mask; it has the line that thresholds it.
+            ValueError: wrong shape, no pixels, negative ids, softness out of range or of ids that are not in the map;
+                a grey image or array with soft edges, for which the message has a threshold.
 
         Example:
             >>> edge = torch.tensor([[1, 1, 1, 2], [1, 1, 1, 2]])

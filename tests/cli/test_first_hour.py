@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageFilter
 
 from kcgs.data import save_image, save_labels
 from tests.cli.conftest import Kcgs
@@ -32,6 +32,12 @@ TRANSCRIPT = [
     ("fit photo.png --regions wide.png -n 20 --iterations 5 --overwrite --resize-regions", 0, "psnr"),
     ("eval scene.safetensors photo.png --regions wide.png", 2, "--resize-regions"),
     ("eval scene.safetensors photo.png --regions wide.png --resize-regions", 0, "psnr"),
+    ("fit photo.png --regions soft.png -n 20 --iterations 5 --overwrite", 1, "--threshold 127"),
+    ("fit photo.png --regions wide-soft.png -n 20 --overwrite --resize-regions", 1, "--threshold 127"),
+    ("fit photo.png --regions soft.png --threshold 127 -n 20 --iterations 5 --overwrite", 0, "psnr"),
+    ("eval scene.safetensors photo.png --regions soft.png --threshold 127", 0, "psnr"),
+    ("encode soft.png --threshold 127 -o soft.kcgs", 0, "label map"),
+    ("fit photo.png --threshold 127 --overwrite", 2, "left out with --regions auto"),
     ("fit glass.png -n 20 --iterations 5", 0, "transparent"),
     ("fit moving.gif -n 20 --iterations 5", 0, "the first is read"),
     ("segment photo.png -o regions.png --method slic --option foo=3", 2, "foo"),
@@ -58,6 +64,9 @@ def _files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         save_image(f"{name}.png", photo)
     Path("photos/broken.png").write_bytes(Path("photo.png").read_bytes()[:500])
     save_labels("wide.png", torch.zeros(48, 128, dtype=torch.long))
+    soft = Image.fromarray((labels * 255).byte().numpy()).filter(ImageFilter.GaussianBlur(1))
+    soft.save("soft.png")
+    soft.resize((128, 48)).save("wide-soft.png")
     save_labels("many.png", torch.arange(48).view(6, 8).repeat_interleave(8, 0).repeat_interleave(8, 1))
     pixels = (photo.permute(1, 2, 0).numpy() * 255).astype(np.uint8)
     Image.fromarray(np.dstack([pixels, np.full((48, 64), 128, np.uint8)])).save("glass.png")

@@ -9,7 +9,7 @@ from kcgs.segment.registry import register
 
 
 @register("file", Cleanup(min_size=1, connected=False))
-def file(image: Tensor, *, path: str | os.PathLike[str]) -> Tensor:
+def file(image: Tensor, *, path: str | os.PathLike[str], threshold: float | None = None) -> Tensor:
     """Take the regions of an image from a mask on disk.
 
     By default nothing is cleaned: no piece is too small, and a label in several pieces is one region.
@@ -17,6 +17,7 @@ def file(image: Tensor, *, path: str | os.PathLike[str]) -> Tensor:
     Args:
         image: as `segment` takes it.
         path: what `kcgs.data.load_labels` reads, of the image's size.
+        threshold: of a mask with soft edges, as `kcgs.data.load_labels` has it.
 
     Raises:
         FileNotFoundError: ``path`` does not exist.
@@ -32,4 +33,4 @@ def file(image: Tensor, *, path: str | os.PathLike[str]) -> Tensor:
     """
     from kcgs.data import load_labels
 
-    return load_labels(path)
+    return load_labels(path, threshold=threshold)
