@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -92,7 +93,8 @@ def eval_command(
 
     loaded, target = check_unbatched(load(scene)), load_image(image)
     labels = read_regions("none" if regions is None else str(regions), target, threshold, resize=resize_regions)
-    report: dict[str, Any] = evaluate(loaded, target, labels)
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # the table says it
+        report: dict[str, Any] = evaluate(loaded, target, labels)
     start = time.perf_counter()
     loaded.render()
     report |= {**describe_scene(loaded), "seconds": time.perf_counter() - start}
@@ -103,7 +105,8 @@ def eval_command(
 def info(scene: SceneFile, as_json: Json = False) -> None:
     """Describe a scene with its regions, a batch of scenes, or a compressed label map.
 
-    Regions have their id, area, centre and mean colour. `view` shows the id of a region that is clicked.
+    Regions have their id, area, mean colour, and x and y of a pixel inside. `view` shows the id of a region that is
+    clicked.
     """
     from kcgs import load
 
@@ -130,7 +133,7 @@ def info(scene: SceneFile, as_json: Json = False) -> None:
         if as_json:
             report["table"] = table
         for row in () if as_json else table:
-            facts = "{area} pixels around {x}, {y}; mean {color}".format_map(row)
+            facts = "{area} pixels, one at {x}, {y}; mean {color}".format_map(row)
             report[f"region {row['id']}"] = facts
     print_report(report, as_json, str(scene))
 
@@ -230,16 +233,17 @@ def _read_map(file: Path) -> Tensor | None:
 
 
 def _describe_regions(scene: Scene) -> list[dict[str, Any]]:
-    """Return the id, the area, the centre in pixels and the mean colour of each region."""
+    """Return the id, the area, a pixel far inside and the mean colour of each region."""
+    from kcgs.maps import interior_points
+
     assert scene.regions is not None
     image, labels = scene.render().detach().clamp(0, 1).cpu(), scene.regions.labels.cpu()
     ids, index = labels.unique(return_inverse=True)
-    y, x = (labels >= 0).nonzero().T
     areas = index.flatten().bincount()
-    *levels, xs, ys = (
-        (index.flatten().bincount(values.flatten().double()) / areas).round().int().tolist()
-        for values in (*(255 * image), x, y)
-    )
+    levels = [
+        (index.flatten().bincount(channel.flatten().double()) / areas).round().int().tolist() for channel in 255 * image
+    ]
+    xs, ys = interior_points(index)[0].T.tolist()
     colors = ["#" + "".join(f"{level:02x}" for level in color) for color in zip(*levels, strict=True)]
     rows = zip(ids.tolist(), areas.tolist(), xs, ys, colors, strict=True)
     return [dict(zip(("id", "area", "x", "y", "color"), row, strict=True)) for row in rows]

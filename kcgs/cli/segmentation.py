@@ -40,7 +40,7 @@ def segment(
         typer.Option(metavar="KEY=VALUE", help="Option of the method, as often as needed; the value is JSON or text."),
     ] = None,
     overlay: Annotated[
-        Path | None, typer.Option(help="Write the image with the regions over it into this file.")
+        Path | None, typer.Option(help="Write the image with the regions and their ids over it into this file.")
     ] = None,
     quiet: Quiet = False,
     methods: Annotated[
@@ -64,7 +64,7 @@ def segment(
         labels, scores, names = segment_with_scores(target, method, **options)
     save_labels(output, labels)
     if overlay is not None:
-        save_image(overlay, overlay_labels(target, labels))
+        save_image(overlay, overlay_labels(target, labels, ids=True))
     table = []
     for region, area in enumerate(labels.flatten().bincount().tolist()):
         name = None if names is None else names[region]

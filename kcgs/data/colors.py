@@ -5,12 +5,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from kcgs._check import check_count
 from kcgs._image import as_image
 from kcgs._labels import check_labels
-from kcgs.maps import touching_pairs
+from kcgs.maps import interior_points, touching_pairs
 
 # step of the hue, the golden ratio less 1: any run of hues is spread over the circle
 _HUE_STEP = 0.6180339887498949
@@ -30,6 +31,11 @@ _SAFE_COLORS = (
 )
 # share of the colour of a region in an overlay
 _TINT = 0.45
+# height of an id in an overlay, in distances from its place to the contour
+_TEXT_SHARE = 1.6
+# least and largest height of an id, in pixels: a smaller one cannot be read, and is left out
+_MIN_TEXT = 7.0
+_MAX_TEXT = 24.0
 
 
 def label_colors(n: int) -> Tensor:
@@ -76,7 +82,7 @@ def colorize_labels(labels: Tensor) -> Tensor:
     return label_colors(len(ids)).to(labels.device)[rank].permute(2, 0, 1).contiguous()
 
 
-def overlay_labels(image: Any, labels: Tensor) -> Tensor:
+def overlay_labels(image: Any, labels: Tensor, *, ids: bool = False) -> Tensor:
     """Return a label map over its image: the image in grey, every region tinted, contours white between black.
 
     The seven colours of Okabe and Ito are told apart with any colour vision. Regions that touch differ in colour,
@@ -85,6 +91,7 @@ def overlay_labels(image: Any, labels: Tensor) -> Tensor:
     Args:
         image: :math:`(3, H, W)` or :math:`(1, H, W)` floating in [0, 1]; or a numpy array (H, W, C), or a PIL image.
         labels: :math:`(H, W)` integer, any non-negative ids.
+        ids: whether the id of each region is written inside of it, where there is room for it.
 
     Returns:
         :math:`(3, H, W)` float32 RGB in [0, 1], on the CPU.
@@ -103,7 +110,7 @@ def overlay_labels(image: Any, labels: Tensor) -> Tensor:
     from skimage.segmentation import mark_boundaries
 
     image = as_image("image", image, tolerance=math.inf).detach()
-    regions = check_labels("labels", labels, dims=(2,)).unique(return_inverse=True)[1].cpu()
+    names, regions = (t.cpu() for t in check_labels("labels", labels, dims=(2,)).unique(return_inverse=True))
     if image.shape[0] not in (1, 3) or image.shape[1:] != regions.shape:
         raise ValueError(
             f"image must have shape (3, H, W) or (1, H, W) with the size of labels, {tuple(regions.shape)}; got "
@@ -113,7 +120,8 @@ def overlay_labels(image: Any, labels: Tensor) -> Tensor:
     colors = _neighbour_colors(regions)[regions].numpy()
     tinted = label2rgb(colors, pixels, colors=_SAFE_COLORS, alpha=_TINT, bg_label=-1)
     marked = mark_boundaries(tinted, regions.numpy(), color=(1, 1, 1), outline_color=(0, 0, 0), mode="inner")
-    return torch.from_numpy(marked).permute(2, 0, 1).float().clamp(0, 1)
+    overlay = torch.from_numpy(marked).permute(2, 0, 1).float().clamp(0, 1)
+    return _write_ids(overlay, regions, names.tolist()) if ids else overlay
 
 
 def _neighbour_colors(regions: Tensor) -> Tensor:
@@ -127,3 +135,16 @@ def _neighbour_colors(regions: Tensor) -> Tensor:
         free = (color for color in range(len(_SAFE_COLORS)) if color not in neighbours)
         colors.append(next(free, region % len(_SAFE_COLORS)))
     return torch.tensor(colors)
+
+
+def _write_ids(image: Tensor, regions: Tensor, names: list[int]) -> Tensor:
+    """Write the id of each region, white with a black outline, where it is widest."""
+    canvas = Image.fromarray((image * 255).round().byte().permute(1, 2, 0).numpy())
+    writer = ImageDraw.Draw(canvas)
+    points, distances = interior_points(regions)
+    for name, point, distance in zip(names, points.tolist(), distances.tolist(), strict=True):
+        size = min(_MAX_TEXT, _TEXT_SHARE * distance / max(1.0, len(str(name)) / 2))
+        if size >= _MIN_TEXT:
+            font = ImageFont.load_default(size)
+            writer.text(point, str(name), "white", font, "mm", stroke_width=max(1, size / 10), stroke_fill="black")
+    return torch.from_numpy(np.asarray(canvas).copy()).permute(2, 0, 1).float() / 255

@@ -3,6 +3,7 @@
 from .antialiasing import antialias, shifted
 from .arguments import as_region_map, map_operands
 from .coverage import TILE, Coverage, make_coverage
+from .interior import interior_points
 from .labels import (
     compact,
     contour_edges,
@@ -23,7 +24,7 @@ from .widths import RADIUS_SIGMAS, ContourWidths, find_widths
 __all__ = [
     "LEAST_BLUR", "MAX_SOFTNESS", "PIXEL", "RADIUS_SIGMAS", "TILE", "ContourWidths", "Coverage", "MapOperands",
     "Membership", "PairSoftness", "RegionMap", "Resampled", "SmoothMembership", "antialias", "as_region_map", "compact",
-    "contour_edges", "cut_windows", "edge_band", "find_widths", "find_windows", "lookup_regions", "make_coverage",
-    "map_operands", "membership_at", "pixels_under", "positions_of", "sharpness", "shifted", "touching_pairs",
-    "unique_pairs", "wrap_labels",
+    "contour_edges", "cut_windows", "edge_band", "find_widths", "find_windows", "interior_points", "lookup_regions",
+    "make_coverage", "map_operands", "membership_at", "pixels_under", "positions_of", "sharpness", "shifted",
+    "touching_pairs", "unique_pairs", "wrap_labels",
 ]  # fmt: skip

@@ -38,7 +38,7 @@ def test_info_lists_regions(kcgs: Kcgs, scene: Scene) -> None:
     assert (table[2]["x"], table[2]["y"]) in {(x, y) for x in (16, 17) for y in (10, 11)}
     mean = (255 * scene().detach().clamp(0, 1)[:, 8:14, 14:20].mean((1, 2))).round().int().tolist()
     assert table[2]["color"] == "#{:02x}{:02x}{:02x}".format(*mean)
-    assert "24 pixels around" in kcgs("info", "scene.safetensors").out
+    assert "24 pixels, one at" in kcgs("info", "scene.safetensors").out
 
 
 @pytest.mark.parametrize("fill", [True, False])

@@ -26,7 +26,7 @@ class TestSegment:
         areas = labels.flatten().bincount().tolist()
         table = [{"id": region, "area": area, "name": None, "score": None} for region, area in enumerate(areas)]
         assert report == {"regions": 2, "method": method, "table": table}
-        expected = overlay_labels(load_image("photo.png"), labels)
+        expected = overlay_labels(load_image("photo.png"), labels, ids=True)
         assert (load_image("over.png") - expected).abs().max() <= 0.5 / 255 + 1e-6
 
     def test_options_are_json_or_text(self, kcgs: Kcgs) -> None:
