@@ -57,13 +57,21 @@ def as_image(name: str, value: object, tolerance: float = 0.0, keep_alpha: bool 
         advice = f"pass {name}.permute(2, 0, 1), or a numpy array (H, W, C)"
         raise InvalidArgument(name, "(C, H, W)", f"{tuple(image.shape)}, which looks like (H, W, C): {advice}")
     if low < -tolerance or high > 1 + tolerance:
-        hint = ": divide it by 255" if 1 < high <= 255 and low >= 0 else ""
-        raise InvalidArgument(name, "in [0, 1]", f"[{low:g}, {high:g}]{hint}")
+        raise InvalidArgument(name, "in [0, 1]", f"[{low:g}, {high:g}]{_scale_hint(image)}")
     if not has_alpha or keep_alpha:
         return image
     if image[-1].min() < 1:
         _warn_of_alpha(name)
     return torch.from_numpy(_on_white(image.numpy()))
+
+
+def _scale_hint(image: Tensor) -> str:
+    """Return what to do with an image whose values are above 1: levels of 8 bits are whole numbers."""
+    low, high = (float(end) for end in image.detach().aminmax())
+    if low < 0:
+        return ""
+    is_8_bit = high <= 255 and bool((image.detach() % 1 == 0).all())
+    return ": divide it by 255" if is_8_bit else f": divide it by {high:g}, or clip it"
 
 
 def _from_array(name: str, array: NDArray[Any]) -> Tensor:

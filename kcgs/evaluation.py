@@ -36,10 +36,13 @@ def evaluate(scene: Scene, image: Any, labels: Any = None, *, visual: bool = Tru
         TypeError: arguments of the wrong type.
         ValueError: an image of another size or number of channels, a label map of another size.
 
+    Warns:
+        RuntimeWarning: the image is too small for SSIM or MS-SSIM, which are NaN.
+
     Example:
         >>> import torch
         >>> from kcgs import GaussianField
-        >>> scene = Scene(GaussianField.random(10, (32, 48), seed=0))
+        >>> scene = Scene(GaussianField.random(10, (161, 192), seed=0))
         >>> metrics = evaluate(scene, scene.render())
         >>> metrics["psnr"], round(metrics["ssim"], 4)
         (inf, 1.0)
@@ -49,8 +52,8 @@ def evaluate(scene: Scene, image: Any, labels: Any = None, *, visual: bool = Tru
         raise InvalidArgument("image", f"the scene's shape {tuple(render.shape)}", tuple(target.shape), verb="have")
     regions = scene.regions if labels is None else as_region_map(labels, "labels")
     target = target.to(render.device)
-    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # NaN says that a metric is not defined
-        metrics = {metric.__name__: float(metric(render, target)) for metric in (psnr, ssim, ms_ssim)}
+    metrics = {metric.__name__: float(metric(render, target)) for metric in (psnr, ssim, ms_ssim)}
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # a map of one region has no contours
         for metric in (ef_psnr, ef_ssim):
             metrics[metric.__name__] = math.nan if regions is None else float(metric(render, target, regions.labels))
     return {**metrics, "ssimulacra2": ssimulacra2(render, target)} if visual else metrics

@@ -58,6 +58,8 @@ def test_errors_survive_pickling_and_copies(kind: type[InvalidArgument] | type[I
         (lambda: as_image("i", torch.zeros(2, 3, 4, 4)), "must be one image"),
         (lambda: as_image("i", [[0.5]]), "i must be a Tensor, a numpy array, a PIL image or a path; got list"),
         (lambda: check_labels("labels", [[1]]), "labels must be a Tensor, a numpy array, a PIL image or a path; got"),
+        (lambda: as_image("i", np.array([[0.5, 4.0]])), r"got \[0.5, 4\]: divide it by 4, or clip it"),
+        (lambda: as_image("i", np.array([[7.0, 4.0]])), r"got \[4, 7\]: divide it by 255"),
         (lambda: as_image("i", np.full((2, 2, 4), 255.0)), r"i must be in \[0, 1\]; got \[255, 255\]"),
         *(
             (lambda s=s: as_image("i", torch.zeros(s)), r"looks like \(H, W, C\): pass i.permute\(2, 0, 1\)")
@@ -130,6 +132,7 @@ def test_maps_mean_the_same_by_every_way_in(mode: str, tmp_path: Path) -> None:
         assert torch.equal(edge_band(value), edge_band(expected))
 
 
+@pytest.mark.filterwarnings("ignore:ms_ssim is NaN:RuntimeWarning")
 def test_paths_are_arguments_of_fit_and_evaluate(tmp_path: Path) -> None:
     image, labels = torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(0)), torch.eye(16).long()
     photo, mask = str(tmp_path / "photo.png"), tmp_path / "mask.png"

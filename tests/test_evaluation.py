@@ -26,7 +26,12 @@ def make_scene(labels: torch.Tensor | None = LABELS) -> Scene:
     return Scene(GaussianField.random(30, SIZE, regions=labels, seed=0), labels)
 
 
+@pytest.mark.filterwarnings("ignore:ms_ssim is NaN:RuntimeWarning")
 class TestEvaluate:
+    def test_small_images_have_no_ms_ssim(self) -> None:
+        with pytest.warns(RuntimeWarning, match="ms_ssim is NaN: the image has 40 x 60 pixels, its window needs 161"):
+            assert math.isnan(evaluate(make_scene(), make_scene().render())["ms_ssim"])
+
     def test_metrics_of_the_clipped_render(self) -> None:
         scene, image = make_scene(), torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(0))
         metrics = evaluate(scene, image)
@@ -64,6 +69,7 @@ class TestEvaluate:
             evaluate(scene, image, labels)
 
 
+@pytest.mark.filterwarnings("ignore:ms_ssim is NaN:RuntimeWarning")
 class TestSsimulacra2:
     def test_values(self, tmp_path: Path) -> None:
         package = pytest.importorskip("ssimulacra2", reason="SSIMULACRA2 needs the package ssimulacra2")

@@ -83,7 +83,8 @@ def config_of(method: str, iterations: int | None) -> FitConfig:
 def figures(result: FitResult, seconds: float, image: Tensor, labels: Tensor) -> Row:
     """Measure a fitted scene and its file."""
     scene, regions = result.scene, result.scene.regions
-    own = evaluate(scene, image, labels)
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # NaN: too small for MS-SSIM
+        own = evaluate(scene, image, labels)
     file = encode(scene, quality=quality_for(own["psnr"]))
     decoded = measure_render(decode(file).scene.render(), image, labels)
     contours = None if regions is None or regions.num_regions == 1 else regions.labels

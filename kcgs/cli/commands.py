@@ -11,7 +11,10 @@ from kcgs.errors import InvalidArgument, InvalidArgumentType
 
 
 class CommandGroup(TyperGroup):
-    """Commands that report an argument which the library refuses as an option with a wrong value."""
+    """Commands that report an argument which the library refuses as an option with a wrong value.
+
+    An option that a command does not have is reported with the commands that have it, unless a similar one is meant.
+    """
 
     def invoke(self, context: Any) -> Any:
         """Run the command that the context names."""
@@ -26,6 +29,21 @@ class CommandGroup(TyperGroup):
                     usage = typer.Context(command, context, name)
                     raise typer.BadParameter(message, usage, parameter) from error
             raise
+        except Exception as error:
+            if getattr(error, "possibilities", None) == []:  # typer exports no class of this error
+                self._name_owners(error)
+            raise
+
+    def _name_owners(self, error: Any) -> None:
+        """Add the commands that have an option to the error that says that one has not."""
+        commands: dict[str, Any] = self.commands
+        owners = [
+            f"kcgs {name}"
+            for name, command in commands.items()
+            if any(error.option_name in parameter.opts for parameter in command.params)
+        ]
+        if owners:
+            error.message += f", which is one of {', '.join(owners)}"
 
 
 app = typer.Typer(

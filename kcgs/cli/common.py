@@ -6,6 +6,7 @@ import json
 import logging
 import math
 import signal
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,6 +18,14 @@ from kcgs.errors import InvalidArgument
 
 # exit status of a program that Ctrl-C ended
 INTERRUPTED = 130
+# when a metric is not defined
+_UNDEFINED = {
+    "ms_ssim": ": a side is below 161 pixels",
+    "ssim": ": a side is below 11 pixels",
+    "ef_ssim": ": no contours, or a side is below 11 pixels",
+    "ef_psnr": ": no contours",
+    "ssimulacra2": ": a side is below 8 pixels",
+}
 
 
 def _scene_path(text: str, other_suffixes: tuple[str, ...] = ()) -> Path:
@@ -81,6 +90,13 @@ def replace_undefined(report: dict[str, Any]) -> dict[str, Any]:
     return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in report.items()}
 
 
+def _explain_undefined(name: str) -> str:
+    """Say why a metric of `evaluate` is not defined."""
+    if name == "ssimulacra2" and find_spec("ssimulacra2") is None:
+        return 'not defined: it needs pip install "kcgs[visual]"'
+    return f"not defined{_UNDEFINED.get(name, '')}"
+
+
 def print_report(report: dict[str, Any], as_json: bool, title: str) -> None:
     """Print a table, or one JSON object."""
     if as_json:
@@ -93,7 +109,7 @@ def print_report(report: dict[str, Any], as_json: bool, title: str) -> None:
     for key, value in report.items():
         if value is not None:
             text = f"{value:.4g}" if isinstance(value, float) else str(value)
-            table.add_row(key, "not defined" if text == "nan" else text)
+            table.add_row(key, _explain_undefined(key) if text == "nan" else text)
     Console(markup=False).print(table)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -74,7 +75,8 @@ def compare(output: Path, image: Tensor, target_bytes: int, **settings: Any) -> 
         seconds = time.perf_counter() - start
         (output / f"{name}.kcgs").write_bytes(result.data)
         save_image(output / f"{name}.png", result.scene.render())
-        metrics = evaluate(result.scene, image, labels, visual=False)
+        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # MS-SSIM is not shown
+            metrics = evaluate(result.scene, image, labels, visual=False)
         psnr, ef_psnr, size = f"{metrics['psnr']:.2f}", f"{metrics['ef_psnr']:.2f}", f"{len(result.data):,}"
         table.add_row(name, psnr, ef_psnr, f"{seconds:.1f}", size)
         lines = f"{size} bytes", f"PSNR {psnr} dB, EF-PSNR {ef_psnr} dB"

@@ -14,7 +14,7 @@ from .common import describe_error
 
 
 def main() -> None:
-    """Run a command: exit status 0 done, 1 failed with one line that says why, 2 wrong usage."""
+    """Run a command: exit status 0 done, 1 failed with one line that says why, 2 wrong usage or a missing file."""
     # torch reads it when it is loaded, which is later: its threads sleep while they wait, and take no core from
     # other programs
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -26,7 +26,7 @@ def main() -> None:
             app(prog_name="kcgs")
     except (ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError) as error:
         typer.echo(f"kcgs: {describe_error(error)}", err=True)
-        sys.exit(1)
+        sys.exit(2 if isinstance(error, FileNotFoundError) else 1)
 
 
 def _print_warning(message: Warning | str, *_: object, **__: object) -> None:

@@ -19,7 +19,7 @@ from kcgs.errors import InvalidArgument
 from . import options
 from .commands import app
 from .common import INTERRUPTED, Json, Quiet, print_report
-from .many_jobs import FitJob, Outcome, fit_one
+from .many_jobs import FitJob, Outcome, fit_one, is_done
 
 
 @app.command("fit-many")
@@ -55,6 +55,9 @@ def fit_many_command(
     The same command again goes on where an earlier one stopped: a file that was made from the same image, mask and
     settings, and not changed since, is kept; any other file that exists is an error of that image without --overwrite.
     One image's failure stops no other; with any, the exit status is 1.
+
+    The table counts images: fitted now, kept from an earlier run, failed, and missed, which are fitted or kept but do
+    not reach --target-psnr.
     """
     if request.target_bytes is not None and suffix == ".safetensors":
         options.exclude("--target-bytes", suffix=suffix)
@@ -88,7 +91,8 @@ def fit_many_command(
                 for warning in outcome.warnings:
                     typer.echo(f"warning: {jobs[index].image.name}: {warning}", err=True)
     except KeyboardInterrupt:
-        done = f"{len(outcomes)} of {len(jobs)} images are done"
+        # a worker may have written a file of which the main process did not hear
+        done = f"{sum(map(is_done, jobs))} of {len(jobs)} images are done"
         typer.echo(f"kcgs: interrupted: {done}; the same command goes on where it stopped", err=True)
         raise typer.Exit(INTERRUPTED) from None
     finally:
@@ -97,8 +101,11 @@ def fit_many_command(
             _write_table(output / "results.csv", rows)
     failures = [row for row in rows if "error" in row]
     misses = [row for row in rows if row.get("target_reached") is False]
-    num_fits = sum(outcome.is_new for outcome in outcomes.values()) - len(failures)
-    counts = {"images": len(rows), "fitted": num_fits, "failed": len(failures), "missed": len(misses)}
+    num_kept = sum(not outcome.is_new for outcome in outcomes.values())
+    counts = {
+        "images": len(rows), "fitted": len(rows) - len(failures) - num_kept, "kept": num_kept,
+        "failed": len(failures), "missed": len(misses),
+    }  # fmt: skip
     print_report(counts | _means(rows), as_json, str(output))
     for row in failures:
         typer.echo(f"kcgs: {Path(row['image']).name}: {row['error']}", err=True)

@@ -74,6 +74,16 @@ def fit_one(job: FitJob) -> Outcome:
         return Outcome({"error": describe_error(error)}, True)
 
 
+def is_done(job: FitJob) -> bool:
+    """Return whether the scene is there, from the same image, mask and settings, and its row."""
+    try:
+        row = _read_row(job.output.with_suffix(".json"))
+        checksum = row.pop("checksum", None)
+        return row.get("fingerprint") == _fingerprint(job) and checksum == _checksum(job.output, row)
+    except OSError:
+        return False
+
+
 def _read_row(record: Path) -> dict[str, Any]:
     """Read the row beside a scene; it is empty if there is none that can be read."""
     try:

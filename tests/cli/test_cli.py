@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import signal
+import sys
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -162,6 +163,15 @@ class TestRender:
 RENDER = ("render", "zoo:chart-pie", "-o", "a.png")
 
 
+def test_metrics_that_are_not_defined_say_why(kcgs: Kcgs, monkeypatch: pytest.MonkeyPatch, photo: None) -> None:
+    monkeypatch.setattr("kcgs.cli.common.find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "ssimulacra2", None)
+    assert kcgs(*FIT, "--regions", "none").code == 0
+    out = kcgs("eval", "scene.safetensors", "photo.png").out
+    assert "not defined: a side is below 161 pixels" in out and "not defined: no contours" in out
+    assert 'not defined: it needs pip install "kcgs[visual]"' in out
+
+
 class TestFailures:
     @pytest.mark.parametrize(
         ("arguments", "code", "words"),
@@ -173,14 +183,14 @@ class TestFailures:
             (("fit", "photo.png", "-n", "0"), 2, "greater than or equal to 1"),
             (("fit", "photo.png", "-n", "10000"), 2, "must be at most 2400, the pixels of the 60 x 40 image"),
             (("fit", "photo.png", "--objective", "visual"), 2, "'visual' is not one of"),
-            (("fit", "nothing.png"), 1, "nothing.png"),
+            (("fit", "nothing.png"), 2, "nothing.png"),
             (("fit", "text.png"), 1, "text.png"),
             (("fit", "photo.png", "--recipe", "none-such"), 2, "'--recipe': must be one of"),
-            (("fit", "photo.png", "--regions", "nothing.png"), 1, "No such file or directory: nothing.png"),
+            (("fit", "photo.png", "--regions", "nothing.png"), 2, "No such file or directory: nothing.png"),
             (("fit", "photo.png", "--regions", "small.png"), 2, "'--regions': must be one map of the image's size"),
             (("fit", "photo.png", "-o", "scene.pt"), 2, "must end in .safetensors"),
             (("fit", "photo.png", "-o", "scene.KCGS"), 2, "must end in .safetensors"),
-            (("fit", "photo.png", "-o", "nowhere/scene.safetensors"), 1, "needs an existing folder"),
+            (("fit", "photo.png", "-o", "nowhere/scene.safetensors"), 2, "needs an existing folder"),
             (("fit", "photo.png", "--max-seconds", "-1"), 2, "'--max-seconds': must be greater than 0; got -1.0"),
             (("fit", "photo.png", "--target-psnr", "-3"), 2, "'--target-psnr': must be greater than 0; got -3.0"),
             (("fit", "photo.png", "-n", "5", "--target-bytes", "90"), 2, "must be left out with --target-bytes; got 5"),
@@ -193,11 +203,12 @@ class TestFailures:
             (("fit", "folder"), 2, "'IMAGE': file 'folder' is a directory"),
             (("info", "text.png"), 2, "'SCENE': must end in .safetensors or .kcgs, or be zoo:NAME; got 'text.png'"),
             (("info", "zoo:nothing"), 2, "zoo entry must be one of"),
-            (("info", "nothing.kcgs"), 1, "kcgs: No such file or directory: nothing.kcgs"),
-            (("decode", "nothing.kcgs", "-o", "a.png"), 1, "kcgs: No such file or directory: nothing.kcgs"),
+            (("info", "nothing.kcgs"), 2, "kcgs: No such file or directory: nothing.kcgs"),
+            (("decode", "nothing.kcgs", "-o", "a.png"), 2, "kcgs: No such file or directory: nothing.kcgs"),
             (("encode", "zoo:chart-pie", "-o", "a.kcgs", "--quality", "500"), 2, "'--quality': must be in [10, 90]"),
             (("encode", "zoo:chart-pie", "-o", "a.kcgs", "--objective", "psnr"), 2, "left out with a scene without"),
             (("segment", "photo.png", "-o", "a.png", "--method", "magic"), 2, "'--method': must be one of"),
+            ((*RENDER, "--device", "cuda"), 2, "No such option: --device, which is one of kcgs fit, kcgs fit-many"),
             ((*RENDER, "--size", "90"), 2, "'--size': must be WxH"),
             ((*RENDER, "--size", "0x5"), 2, "'--size': must be at least 1 x 1"),
             ((*RENDER, "--scale", "-1"), 2, "'--scale': must be in (0, 1e+06]; got -1.0"),

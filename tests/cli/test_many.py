@@ -59,7 +59,7 @@ class TestTable:
         code, out, err = fit_many("photos", *SETTINGS, "--json")
         assert code == 0, err
         report, table = json.loads(out), rows()
-        assert [report[key] for key in ("images", "fitted", "failed", "missed")] == [3, 3, 0, 0]
+        assert [report[key] for key in ("images", "fitted", "kept", "failed", "missed")] == [3, 3, 0, 0, 0]
         assert list(table) == ["a", "b", "c"]
         files = {f"{name}.{suffix}" for name in table for suffix in ("safetensors", "json")}
         assert {path.name for path in Path("out").iterdir()} == {"results.csv", *files}
@@ -72,9 +72,9 @@ class TestTable:
         assert report["mean_psnr"] == pytest.approx(sum(float(row["psnr"]) for row in table.values()) / 3)
 
     def test_targets_that_are_missed(self, fit_many: Kcgs) -> None:
-        for fitted in (2, 0):  # the second time both scenes are kept
+        for fitted, kept in ((2, 0), (0, 2)):
             code, out, err = fit_many("photos/a.png", "photos/b.png", *SETTINGS, "--json", "--target-psnr", "80")
-            assert code == 1 and [json.loads(out)[key] for key in ("missed", "fitted")] == [2, fitted]
+            assert code == 1 and [json.loads(out)[key] for key in ("missed", "fitted", "kept")] == [2, fitted, kept]
             assert "--target-psnr was not reached by a.png, b.png" in err
         assert {row["target_reached"] for row in rows().values()} == {"False"}
 
@@ -201,6 +201,12 @@ class TestResume:
         assert fit_many("photos", *SETTINGS) == (130, "", message)
         assert list(rows()) == ["a"]
 
+    def test_interrupted_again(self, fit_many: Kcgs, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Scenes of an earlier run are done, too."""
+        assert fit_many("photos", *SETTINGS).code == 0
+        monkeypatch.setattr("kcgs.engine.run_jobs", lambda *_, **__: signal.raise_signal(signal.SIGINT))
+        assert fit_many("photos", *SETTINGS).err.startswith("kcgs: interrupted: 3 of 3 images are done;")
+
 
 class TestFailures:
     def test_one_image_stops_no_other(self, fit_many: Kcgs) -> None:
@@ -224,11 +230,11 @@ class TestFailures:
         [
             (("photos", "masks"), 2, "must have different stems; got photos/a.png and masks/a.png"),
             (("photos", "--regions", "masks"), 2, "'--regions': must have different stems; got"),
-            (("photos", "--regions", "mask"), 1, "mask"),
+            (("photos", "--regions", "mask"), 2, "mask"),
             (("photos", "--recipe", "worst"), 2, "'--recipe': must be one of"),
             (("photos", "--engine", "slurm"), 2, "slurm"),
             (("empty",), 2, "must hold images"),
-            (("nowhere",), 1, "kcgs: No such file or directory: nowhere"),
+            (("nowhere",), 2, "kcgs: No such file or directory: nowhere"),
             (("photos", "-n", "5", "--target-bytes", "90"), 2, "must be left out with --target-bytes"),
             (("photos", "--suffix", ".safetensors", "--target-bytes", "90"), 2, "must be left out with --target-bytes"),
         ],
