@@ -36,10 +36,9 @@ class CommandGroup(TyperGroup):
 
     def _name_owners(self, error: Any) -> None:
         """Add the commands that have an option to the error that says that one has not."""
-        commands: dict[str, Any] = self.commands
         owners = [
             f"kcgs {name}"
-            for name, command in commands.items()
+            for name, command in self.commands.items()
             if any(error.option_name in parameter.opts for parameter in command.params)
         ]
         if owners:

@@ -28,8 +28,12 @@ Numbers = Tensor | NDArray[Any] | Sequence[Any] | float
 
 # standard deviation of a flat Gaussian, in longer sides of the image: its values differ by 3 in 10^7 at most
 _FLAT_SIGMA = 1e3
-# share of a region's pixels that are no brighter than those that get its new colour: brighter ones saturate
+# share of a region's pixels that are no brighter than those that get its new colour
 _BRIGHT_SHARE = 0.9
+# share of them that stay within [0, 1]: glints beyond may clip
+_UNCLIPPED_SHARE = 0.995
+# least share of the new colour that the former get, so that the latter stay
+_LEAST_COLOR = 0.75
 # their luma, at least, for contrast: in darker regions noise would be seen
 _MIN_LUMA = 0.25
 # standard deviations of a soft contour beyond which it is taken as 0 or 1
@@ -111,8 +115,9 @@ def recolor_region(
 
     Convention: a gain acts on the colours of the Gaussians. A bias is one more Gaussian per region, flat over the whole
     image, for pixels are sums of Gaussians, not means. A `color` is that of the brightest tenth of a region, and keeps
-    its shading: it is multiplied by the luma of each pixel over the luma there. Regions whose brightest tenth is below
-    a quarter get the contrast of one where it is a quarter.
+    its shading: it is multiplied by the luma of each pixel over the luma there. Where brighter pixels would pass 1, the
+    region is darker, the brightest tenth by a quarter at most: then the contrast is less. Regions whose brightest tenth
+    is below a quarter get the contrast of one where it is a quarter.
 
     Args:
         scene: with region ids; of a batch, all images. With `color` it needs a map.
@@ -166,7 +171,7 @@ def _recolor(scene: Scene, ids: list[int], gain: Numbers, bias: Numbers | None) 
 
 
 def _paint(scene: Scene, region_id: int, color: str | Numbers) -> Scene:
-    """Give a region a colour: the colour times 1 + contrast (luma - luma of the brightest tenth)."""
+    """Give a region a colour: the colour times a linear function of the luma, 1 at that of the brightest tenth."""
     if scene.regions is None:
         raise InvalidArgument("scene", "a label map", "none", verb="have")
     pixels = scene.regions.labels == region_id
@@ -179,9 +184,15 @@ def _paint(scene: Scene, region_id: int, color: str | Numbers) -> Scene:
     weights = image.new_tensor(LUMA) if channels == len(LUMA) else image.new_full((channels,), 1 / channels)
     luma = torch.einsum("...chw,c->...hw", image, weights)
     inside = luma[pixels.expand(luma.shape)]
-    reference = inside.kthvalue(math.ceil(_BRIGHT_SHARE * len(inside))).values
+    reference, brightest = (
+        inside.kthvalue(math.ceil(share * len(inside))).values for share in (_BRIGHT_SHARE, _UNCLIPPED_SHARE)
+    )
     contrast = 1.0 / reference.clamp_min(_MIN_LUMA)
-    bias = target * (1.0 - contrast * reference)
+    top, limit = 1.0 + contrast * (brightest - reference), 1.0 / target.max()
+    if 1.0 <= limit < top:
+        contrast = torch.minimum(contrast * limit / top, (limit - _LEAST_COLOR) / (brightest - reference))
+        top = limit
+    bias = target * (top - contrast * brightest)
     return _recolor(scene, [region_id], contrast * torch.outer(target, weights), bias if bias.any() else None)
 
 

@@ -342,11 +342,27 @@ class TestRecolor:
             return float(luma(scene)[pixels].sort().values[math.ceil(0.9 * int(pixels.sum())) - 1])
 
         scene = recolor_region(scene, BOX, level / brightest())
-        changed, color = recolor_region(scene, BOX, color="#0080ff"), torch.tensor([0.0, 128 / 255, 1.0])
+        changed, color = recolor_region(scene, BOX, color="#001a33"), torch.tensor([0.0, 26 / 255, 51 / 255])
         assert changed.num_gaussians == scene.num_gaussians + added
         ratio = 1 + (luma(scene)[pixels] - brightest()) / max(level, 0.25)
         torch.testing.assert_close(changed().detach()[:, pixels], color[:, None] * ratio, rtol=0, atol=1e-4)
         torch.testing.assert_close(changed().detach()[:, ~pixels], scene().detach()[:, ~pixels], rtol=0, atol=1e-5)
+
+    @pytest.mark.parametrize(("glint", "is_flatter"), [(1.2, False), (2.0, True)])
+    def test_a_colour_does_not_clip(self, glint: float, is_flatter: bool) -> None:
+        """A twentieth of the box is brighter than the rest: it stays so, and the rest gets a bit darker."""
+        labels = shapes()
+        y, x = (labels == BOX).nonzero().T
+        levels = torch.linspace(0.0, 0.4, len(y))
+        levels[-len(y) // 20 :] *= glint
+        size = torch.full((len(y),), 0.05)
+        field = GaussianField(
+            torch.stack([x, y], -1) + 0.5, torch.stack([size, 0 * size, size], -1), levels[:, None].expand(-1, 3),
+            labels[y, x], size=SIZE,
+        )  # fmt: skip
+        changed = recolor_region(Scene(field, labels), BOX, color="red")().detach()[0, y, x]
+        assert changed.max() == pytest.approx(1.0, abs=1e-3) and changed.diff().min() >= -1e-4
+        assert 0.74 < changed[int(0.9 * len(y))] < 0.9 and (changed[0] > 0.1) == is_flatter
 
     def test_without_bias_no_gaussian_is_added(self) -> None:
         scene = scene_of(MAPS["hard"]())
