@@ -39,6 +39,15 @@ def segment(
         list[str] | None,
         typer.Option(metavar="KEY=VALUE", help="Option of the method, as often as needed; the value is JSON or text."),
     ] = None,
+    box: Annotated[
+        str | None, typer.Option(metavar="X0,Y0,X1,Y1", help="Of grabcut and sam: a box around the object.")
+    ] = None,
+    foreground: Annotated[
+        list[str] | None, typer.Option(metavar="X,Y", help="Of grabcut and sam: a point of the object.")
+    ] = None,
+    background: Annotated[
+        list[str] | None, typer.Option(metavar="X,Y", help="Of grabcut and sam: a point that is not of the object.")
+    ] = None,
     overlay: Annotated[
         Path | None, typer.Option(help="Write the image with the regions and their ids over it into this file.")
     ] = None,
@@ -59,6 +68,11 @@ def segment(
     if overlay is not None:
         check_output(overlay, *WRITTEN_IMAGES, name="overlay")
     options = _parse_options(option or [])
+    if box is not None:
+        options["box"] = _parse_numbers("box", "X0,Y0,X1,Y1", box)
+    for key, points in (("foreground", foreground), ("background", background)):
+        if points:
+            options[key] = [_parse_numbers(key, "X,Y", point) for point in points]
     target = load_image(image)
     with Progress("finding regions", pulse=True, visible=not quiet):
         labels, scores, names = segment_with_scores(target, method, **options)
@@ -78,6 +92,16 @@ def segment(
             facts = [f"{row['area']} pixels", row["name"], row["score"] is not None and f"score {row['score']:.2f}"]
             report[f"region {row['id']}"] = ", ".join(filter(None, facts))
     print_report(report, as_json, str(output))
+
+
+def _parse_numbers(option: str, expected: str, text: str) -> list[float]:
+    try:
+        numbers = [float(number) for number in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != expected.count(",") + 1:
+        raise InvalidArgument(option, f"{expected} in pixels", repr(text))
+    return numbers
 
 
 def _parse_options(pairs: list[str]) -> dict[str, Any]:

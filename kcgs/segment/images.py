@@ -4,6 +4,7 @@ import math
 from typing import Any
 
 import numpy as np
+import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -27,6 +28,15 @@ def check_segment_image(image: Any) -> Tensor:
 def to_pixels(image: Tensor) -> NDArray[np.float32]:
     """Return a checked image as (H, W, 3)."""
     return image.permute(1, 2, 0).cpu().numpy()
+
+
+def reduce_image(image: Tensor, max_pixels: int) -> Tensor:
+    """Return a checked image with `max_pixels` at most."""
+    shrink = math.sqrt(image[0].numel() / max_pixels)
+    if shrink <= 1:
+        return image
+    size = [max(1, round(side / shrink)) for side in image.shape[1:]]
+    return check_segment_image(F.interpolate(image[None], size, mode="area")[0])
 
 
 def rgb_to_lab(image: Tensor) -> NDArray[np.float32]:

@@ -71,6 +71,9 @@ def segment_with_scores(image: Any, method: str = "auto", **options: Any) -> Seg
     for option in options:
         if option not in defaults:
             raise InvalidArgumentType("option", f"one of the method {method!r}, {', '.join(defaults)}", repr(option))
+    for option, default in defaults.items():
+        if default is inspect.Parameter.empty and option not in options:
+            raise InvalidArgumentType(option, f"given for the method {method!r}", "none")
     function, cleanup = _methods[method]
     cleanup = replace(cleanup, **{name: options.pop(name) for name in asdict(cleanup) if name in options})
     pixels = check_segment_image(image)

@@ -48,12 +48,23 @@ class TestSegment:
         out = kcgs(*arguments).out
         assert "the wall" in out and "a [red] door" in out and "0.75" in out and "nan" not in out
 
+    def test_a_box_and_clicks(self, kcgs: Kcgs) -> None:
+        pytest.importorskip("cv2", reason="needs the extra: pip install 'kcgs[grabcut]'")
+        arguments = ("--method", "grabcut", "--box", "15,6,50,34", "--foreground", "30,20", "--background", "5,5")
+        run = kcgs(*SEGMENT, *arguments)
+        assert run.code == 0 and " pixels, object" in run.out and " pixels, background" in run.out
+        assert (load_labels("out.png") == load_labels("mask.png")).float().mean() > 0.99
+
     @pytest.mark.parametrize(
         ("arguments", "code", "words"),
         [
             (("--option", "colour=3"), 2, "'--option': must be one of the method 'auto'"),
             (("--option", "max_regions=many"), 1, "kcgs: max_regions must be an integer; got 'many'"),
             (("--option", "nonsense"), 2, "'--option': must be KEY=VALUE; got 'nonsense'"),
+            (("--method", "grabcut"), 2, "'--box': must be given for the method 'grabcut'"),
+            (("--method", "grabcut", "--box", "1,2,3"), 2, "'--box': must be X0,Y0,X1,Y1 in pixels; got '1,2,3'"),
+            (("--method", "sam", "--background", "1"), 2, "'--background': must be X,Y in pixels; got '1'"),
+            (("--box", "1,2,3,4"), 2, "'--option': must be one of the method 'auto'"),
             (("--overlay", "over.txt"), 2, "'--overlay': must end in .png"),
         ],
     )

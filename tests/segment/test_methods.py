@@ -81,7 +81,7 @@ class TestRegistry:
         monkeypatch.setattr("kcgs.segment.registry._methods", dict(_methods))
 
     def test_names(self) -> None:
-        assert {*METHODS, "dino", "file", "lseg", "onnx", "sam", "text"} <= set(available_methods())
+        assert {*METHODS, "dino", "file", "grabcut", "lseg", "onnx", "sam", "text"} <= set(available_methods())
         assert method_options("slic")["n_segments"] == 400
 
     def test_a_function_gets_the_image_and_the_values_of_its_cleanup(self) -> None:

@@ -136,6 +136,8 @@ CASES = [
             ({"boxes": BOXES}, None),
             ({"boxes": torch.tensor(BOXES)}, None),
             ({"points": [[[20, 20], [50, 38]]]}, None),
+            ({"foreground": [[20, 20]], "background": [[50, 38]]}, None),
+            ({"box": BOXES[0], "foreground": torch.tensor([[20, 20]])}, None),
             ({"grid": 2, "min_score": 0.0, "max_regions": 5, "min_size": 4}, None),
             ({"grid": 1, "min_score": 1.0}, 1),
         )
@@ -170,6 +172,11 @@ class TestSegment:
         labels = segment(torch.rand(3, *size), "dino", model=folder("dinov2"), longer_side=64)
         assert labels.shape == size
 
+    @pytest.mark.parametrize("model", SAMS)
+    def test_a_box_is_one_of_boxes(self, folder: Folder, model: str) -> None:
+        first = segment(IMAGE, "sam", model=folder(model), box=BOXES[0])
+        assert torch.equal(first, segment(IMAGE, "sam", model=folder(model), boxes=BOXES[:1]))
+
     def test_masks_that_no_mask_covers_have_no_score(self, folder: Folder) -> None:
         scores = segment_with_scores(IMAGE, "sam", model=folder("sam"), grid=1, min_score=1.0).scores
         assert scores is not None and scores.isnan().all()
@@ -193,6 +200,8 @@ class TestSegment:
             ("sam", {"boxes": [[1, 2], [3]]}, "boxes must be numbers"),
             ("sam", {"points": torch.zeros(0, 1, 2)}, "points must be numbers"),
             ("sam", {"points": [[[1, 2]]], "boxes": torch.ones(1, 4)}, "boxes must be None"),
+            ("sam", {"boxes": BOXES, "box": BOXES[0]}, "boxes must be None with box"),
+            ("sam", {"background": [[1, 2]]}, "foreground must be given where there is no box"),
             ("sam", {"grid": 0}, "grid must be"),
             ("sam", {"min_score": 1.5}, "min_score must be"),
             ("text", {"prompts": "dog"}, "prompts must be a list of strings"),

@@ -11,7 +11,7 @@ from kcgs.compiled import image_threads_for_kernels
 from kcgs.functional import merge_regions
 from kcgs.functional.merging import Labels
 from kcgs.segment.cleanup import Cleanup, clean, merge_similar, to_regions
-from kcgs.segment.images import check_segment_image, lab_sums, rgb_to_lab
+from kcgs.segment.images import lab_sums, reduce_image, rgb_to_lab
 from kcgs.segment.registry import register
 from kcgs.segment.snapping import snap_contours
 
@@ -58,7 +58,7 @@ def auto(image: Tensor, *, min_size: int, max_regions: int | None) -> Tensor:
     image = image.cpu()
     if image[0].numel() <= _LARGE:
         return torch.from_numpy(_regions(image, min_size))
-    small = _reduce(image)
+    small = reduce_image(image, _MAX_PIXELS)
     smallest = max(1, round(min_size * small[0].numel() / image[0].numel()))
     regions = _regions(small, smallest)
     if max_regions is not None:
@@ -80,7 +80,7 @@ def _felzenszwalb_regions(image: Tensor, scale: float, min_size: int) -> Labels:
     """Return 4-connected regions of (3, H, W), of at least ``min_size`` pixels, contours on edges."""
     from skimage.segmentation import felzenszwalb
 
-    small = _reduce(image)
+    small = reduce_image(image, _MAX_PIXELS)
     smallest = max(1, round(min_size * small[0].numel() / image[0].numel()))
     # Lab over 100 has about the range of RGB in [0, 1], for which scales are usually given
     raw = felzenszwalb(rgb_to_lab(small) / 100, scale=scale, sigma=_SIGMA, min_size=smallest)
@@ -89,15 +89,6 @@ def _felzenszwalb_regions(image: Tensor, scale: float, min_size: int) -> Labels:
 
 def _shrink(image: Tensor) -> float:
     return max(1.0, math.sqrt(image[0].numel() / _MAX_PIXELS))
-
-
-def _reduce(image: Tensor) -> Tensor:
-    """Return (3, H, W) at the size at which it is segmented."""
-    shrink = _shrink(image)
-    if shrink == 1:
-        return image
-    size = [max(1, round(side / shrink)) for side in image.shape[1:]]
-    return check_segment_image(F.interpolate(image[None], size, mode="area")[0])
 
 
 def _enlarge(image: Tensor, regions: Labels) -> Labels:

@@ -9,8 +9,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from kcgs._check import check_count, check_number
+from kcgs.errors import InvalidArgument
 from kcgs.segment.cleanup import Prediction
 from kcgs.segment.networks import load_pretrained, preprocess
+from kcgs.segment.prompts import Points, Prompt, check_prompt
 from kcgs.segment.registry import register
 
 # prompts per pass of the network
@@ -29,16 +31,20 @@ def sam(
     model: str | os.PathLike[str] | Any = "facebook/sam2.1-hiera-tiny",
     boxes: Tensor | Sequence[Any] | None = None,
     points: Tensor | Sequence[Any] | None = None,
+    box: Points | None = None,
+    foreground: Points | None = None,
+    background: Points | None = None,
     grid: int = 16,
     min_score: float = 0.88,
 ) -> Prediction:
     """Segment by Segment Anything (Kirillov et al., ICCV 2023) or SAM 2 (Ravi et al., ICLR 2025).
 
-    A box, or a set of points, asks for one object and gets its best mask. Without either, a grid of points asks for
-    everything: of the three masks per point those are taken that the model scores at least ``min_score`` and that
-    hardly depend on the threshold. Of two masks that overlap by more than 0.7 (intersection over union) the better is
-    taken. Smaller masks lie over larger ones. Each connected piece that no mask covers is a region too. The score of a
-    region is the overlap that the model predicts for its mask, NaN without a mask.
+    A box, or a set of points, asks for one object and gets its best mask; so do ``box``, ``foreground`` and
+    ``background`` together, as for the method ``grabcut``. Without any, a grid of points asks for everything: of the
+    three masks per point those are taken that the model scores at least ``min_score`` and that hardly depend on the
+    threshold. Of two masks that overlap by more than 0.7 (intersection over union) the better is taken. Smaller masks
+    lie over larger ones. Each connected piece that no mask covers is a region too. The score of a region is the overlap
+    that the model predicts for its mask, NaN without a mask.
 
     Args:
         image: as `segment` takes it, any size.
@@ -46,19 +52,27 @@ def sam(
             ``SamModel`` or ``Sam2Model``.
         boxes: :math:`(K, 4)` left, top, right, bottom in pixels; a tensor or a list.
         points: :math:`(K, P, 2)` for K objects of P points each, (x, y) in pixels; a tensor or a list.
-        grid: points along each side where there are neither boxes nor points, at least 1.
+        box: left, top, right, bottom of one object, in pixels.
+        foreground: :math:`(P, 2)` points (x, y) of it.
+        background: :math:`(P, 2)` points (x, y) that are not of it.
+        grid: points along each side where there is none of these, at least 1.
         min_score: of the grid's masks, in [0, 1], against the overlap that the model predicts.
 
     Raises:
         ValueError: an argument has another shape or is out of its range, or the weights do not fit the model.
 
     Example:
-        ``segment(image, "sam", boxes=[[30, 40, 200, 180]])``
+        ``segment(image, "sam", box=(30, 40, 200, 180), background=[(60, 70)])``
     """
     check_count("grid", grid)
     check_number("min_score", min_score, 0, 1)
-    is_grid = boxes is None and points is None
-    prompts = _prompts(boxes, _grid_points(image, grid) if is_grid else points)
+    prompt = check_prompt(image, box, foreground, background)
+    is_grid = False
+    if prompt.box is not None or prompt.foreground or prompt.background:
+        prompts = _object_prompts(prompt, boxes, points)
+    else:
+        is_grid = boxes is None and points is None
+        prompts = _prompts(boxes, _grid_points(image, grid) if is_grid else points)
     network = load_pretrained("AutoModelForMaskGeneration", model, image.device)
     side, (height, width) = network.prompt_encoder.input_image_size, image.shape[1:]
     size = (side, side)
@@ -95,6 +109,22 @@ def _prompts(boxes: Any, points: Any) -> dict[str, Tensor]:
     return {"input_points": points, "input_labels": torch.ones(points.shape[:3]).long()}
 
 
+def _object_prompts(prompt: Prompt, boxes: Any, points: Any) -> dict[str, Tensor]:
+    """Return the prompt of one object as the network's inputs, (1, 1, ...)."""
+    for name, values in (("boxes", boxes), ("points", points)):
+        if values is not None:
+            raise InvalidArgument(name, "None with box, foreground or background", "both")
+    if prompt.box is None and not prompt.foreground:
+        raise InvalidArgument("foreground", "given where there is no box", "none")
+    inputs: dict[str, Tensor] = {}
+    if prompt.box is not None:
+        inputs["input_boxes"] = torch.tensor([[prompt.box]])
+    if clicks := prompt.foreground + prompt.background:
+        inputs["input_points"] = torch.tensor([[clicks]])
+        inputs["input_labels"] = torch.tensor([[[1] * len(prompt.foreground) + [0] * len(prompt.background)]])
+    return inputs
+
+
 def _to_tensor(name: str, values: Any, shape: tuple[int | None, ...]) -> Tensor:
     """Return a tensor, or a list from the command line, as a tensor of a shape; None: any size."""
     expected = f"{name} must be numbers of shape ({', '.join('any' if n is None else str(n) for n in shape)})"
@@ -123,7 +153,7 @@ def _predict_masks(network: Any, square: Tensor, prompts: dict[str, Tensor], sca
         for name in ("input_boxes", "input_points"):
             if name in batch:  # the prompt encoder adds half a pixel
                 batch[name] = (batch[name].unflatten(-1, (-1, 2)) * scale - 0.5).flatten(-2)
-        is_ambiguous = "input_points" in batch and batch["input_points"].shape[2] == 1
+        is_ambiguous = "input_boxes" not in batch and batch["input_points"].shape[2] == 1
         batch = {name: values.to(square.device) for name, values in batch.items()}
         result = network(image_embeddings=embeddings, multimask_output=is_ambiguous, **batch)
         logits.append(result.pred_masks[0].float())
