@@ -77,7 +77,7 @@ class TestFitVideo:
         ("arguments", "code", "words"),
         [
             (("-o", "a.kcgs"), 2, "must end in .safetensors"),
-            (("--regions", "nothing.png"), 1, "nothing.png"),
+            (("--regions", "nothing.png"), 2, "nothing.png"),
             (("--max-seconds", "3"), 2, "No such option"),
         ],
     )
