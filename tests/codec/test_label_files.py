@@ -206,7 +206,7 @@ class TestCommands:
             ("decode mask.kcgs -o b.jpg", 2, ".png or .npy"),
             ("encode mask.kcgs -o b.kcgs", 1, "kcgs decode writes it"),
             ("render mask.kcgs -o b.png", 1, "it is a label map, no scene"),
-            ("encode none.png -o b.kcgs", 1, "No such file or directory: none.png"),
+            ("encode none.png -o b.kcgs", 2, "No such file or directory: none.png"),
         ):
             assert message in run(*command.split(), code=code)
         Path("mask.kcgs").write_bytes(Path("mask.kcgs").read_bytes()[:-1])
