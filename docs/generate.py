@@ -8,6 +8,7 @@ import inspect
 import re
 import shutil
 import typing
+from collections.abc import Callable
 from importlib.resources import files
 from pathlib import Path
 from types import ModuleType
@@ -238,6 +239,8 @@ def _type(annotation: Any) -> str:
     """Return a type as readers of settings know it: `float`, `"auto"`, one of several with "or" between."""
     if typing.get_origin(annotation) is typing.Literal:
         return " or ".join(f"`{value!r}`" for value in typing.get_args(annotation))
+    if typing.get_origin(annotation) is Callable:
+        return "a function"
     alternatives = [part for part in typing.get_args(annotation) if part is not type(None)]
     if alternatives and typing.get_origin(annotation) is not tuple:
         return " or ".join(map(_type, alternatives))

@@ -5,15 +5,17 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
-from torch.optim.lr_scheduler import LambdaLR
 
 from kcgs.compiled import threads_for_kernels
-from kcgs.fitting.optimizers import cosine_decay
 from kcgs.functional import RegionMap, region_splat
 from kcgs.functional.weights import weighted_sums
 from kcgs.nn import GaussianField
 from kcgs.nn.field import join
 from kcgs.optim import GaussianAdam
+from kcgs.optim.descent import FieldDescent
+from kcgs.optim.gaussians import Canvas, Gaussians
+from kcgs.optim.objectives import SquaredError
+from kcgs.optim.run import End, cosine_decay, count_iterations, run
 from kcgs.scene import Scene
 
 from .inpainting import inpaint_from_matches
@@ -34,6 +36,7 @@ _LEAST_ADDED = 16
 # their standard deviation, in the distance between them
 _SIGMA = 0.6
 _STEPS = 120
+_CUTOFF = 1e-4
 # learning rates; with larger ones Gaussians that are alike swing, and the hole shows ripples
 _RATE = 0.07
 _COLOR_RATE = 0.015
@@ -100,19 +103,13 @@ def _spread(residual: Tensor, mask: Tensor, regions: RegionMap, density: float) 
     return GaussianField(means, cholesky, (residual[:, y, x] / total).T, ids, size=regions.size)
 
 
-@torch.enable_grad()
 def _fit(field: GaussianField, regions: RegionMap, target: Tensor, weight: Tensor) -> GaussianField:
     """Fit Gaussians to a target, with a weight per pixel; opacities are merged into the colours."""
-    geometry = field.means.detach(), field.cholesky.detach()
-    field = GaussianField(*geometry, field.merged_colors().detach(), field.region_ids, size=field.size)
+    field = Gaussians.of(field).field(field.size)
     # tensors, so that the schedule, too, is in the precision of the field
     rate, color_rate = field.means.detach().new_tensor([_RATE, _COLOR_RATE])
     optimizer = GaussianAdam(field, rate, color_lr=color_rate)
-    schedule = LambdaLR(optimizer, lambda step: cosine_decay(step / _STEPS))
-    for _ in range(_STEPS):
-        rendered = region_splat(field.means, field.cholesky, field.colors, field.region_ids, regions)
-        rendered.backward((rendered.detach() - target) * weight)
-        optimizer.step()
-        optimizer.zero_grad()
-        schedule.step()
+    canvas = Canvas(field.size, regions, _CUTOFF)
+    descent = FieldDescent(field, optimizer, SquaredError(target, weight), canvas)
+    run(descent, count_iterations(descent, _STEPS), [End()], cosine_decay)
     return field

@@ -8,8 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .descent import backward, takes_one_pass
-from .state import FitState
+from kcgs.optim.descent import FieldDescent
 
 
 class CapturedStep:
@@ -28,35 +27,29 @@ class CapturedStep:
         """Capture anew at the next call."""
         self._is_valid = False
 
-    def __call__(self, state: FitState) -> None:
+    def __call__(self, descent: FieldDescent) -> None:
         """Take a step, with the learning rates of the moment."""
-        device, groups, is_first = state.problem.image.device, state.optimizer.param_groups, not self._rates
+        device, groups, is_first = descent.field.means.device, descent.optimizer.param_groups, not self._rates
         if is_first:
             self._rates = [torch.empty((), device=device) for _ in groups]
         elif not self._is_valid:
-            self._graph, self._is_valid = _record(lambda: self._step(state), self._graph, device), True
+            self._graph, self._is_valid = _record(lambda: self._step(descent), self._graph, device), True
         for rate, group in zip(self._rates, groups, strict=True):
             rate.fill_(group["lr"])
         if is_first:
-            self._step(state)
+            self._step(descent)
         else:
             self._graph.replay()
 
-    def _step(self, state: FitState) -> None:
+    def _step(self, descent: FieldDescent) -> None:
         """Take a step that reads the learning rates where a replay finds them."""
-        groups = state.optimizer.param_groups
+        groups = descent.optimizer.param_groups
         numbers = [group["lr"] for group in groups]
         for group, rate in zip(groups, self._rates, strict=True):
             group["lr"] = rate
-        backward(state, None)
-        state.optimizer.step()
+        FieldDescent.move(descent)
         for group, number in zip(groups, numbers, strict=True):
             group["lr"] = number
-
-
-def is_capturable(state: FitState) -> bool:
-    """Whether steps of the state are a kernel's programs alone, on a GPU."""
-    return state.runs_ahead and state.problem.image.is_cuda and takes_one_pass(state.problem)
 
 
 def _record(step: Callable[[], None], previous: Any, device: torch.device) -> Any:

@@ -1,6 +1,11 @@
-"""The clock of a fit."""
+"""The clock of a fit, and the end that it sets."""
 
+from __future__ import annotations
+
+import math
 import time
+
+from .state import FitState
 
 
 class Clock:
@@ -12,3 +17,18 @@ class Clock:
     def seconds(self) -> float:
         """Seconds that the fit has used."""
         return time.perf_counter() - self._started
+
+
+class EndOfTime:
+    """Ends a fit whose seconds are over."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.clock = clock
+
+    def due(self, state: FitState) -> float:
+        """Return the end of the schedule, which follows the clock."""
+        return 1.0
+
+    def act(self, state: FitState) -> str | None:
+        """Return that time is the reason, if it is."""
+        return "seconds" if self.clock.seconds() >= (state.problem.config.max_seconds or math.inf) else None

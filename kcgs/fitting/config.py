@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import math
 import tomllib
+from collections.abc import Callable
 from difflib import get_close_matches
 from importlib.resources import files
 from typing import Any, Literal, cast
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from torch import Tensor
 
 from kcgs._repr import shorten
 from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.kernels import BACKENDS
 from kcgs.maps import MAX_SOFTNESS
+from kcgs.nn import GaussianField
+from kcgs.optim.run import Event
 
-Objective = Literal["auto", "psnr", "ms-ssim"]
+ObjectiveName = Literal["auto", "psnr", "ms-ssim"]
 _USUAL_ITERATIONS = 700
 
 
@@ -33,7 +37,7 @@ class FitConfig(BaseModel):
         False
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
 
     # The model
     guidance: bool = Field(True, description="confine Gaussians to regions, where regions are given")
@@ -56,8 +60,8 @@ class FitConfig(BaseModel):
         description="where the first centres are; uniform: anywhere, with the image's colours; random: anywhere, with "
         "random colours; gradient: where the image changes, as Image-GS",
     )
-    densify: Literal["matching-pursuit", "largest-error"] = Field(
-        "matching-pursuit", description="where Gaussians are added; largest-error: as Image-GS"
+    densify: Literal["matching-pursuit", "largest-error"] | Event = Field(
+        "matching-pursuit", description="where Gaussians are added; largest-error: as Image-GS; or an event of your own"
     )
     densify_from: float = Field(0.01, gt=0.0, le=1.0, description="fraction of N at the start; the rest is added later")
     warmup: bool = Field(
@@ -77,16 +81,16 @@ class FitConfig(BaseModel):
     )
 
     # The descent
-    objective: Objective = Field(
+    objective: ObjectiveName | Callable[[Tensor], Tensor] = Field(
         "auto",
         description="psnr: minimize `loss`; ms-ssim: maximize MS-SSIM, with loss l2; auto: ms-ssim for a file of a "
-        "given size, else psnr",
+        "given size, else psnr; or a loss of your own, a function from a render (1, C, H, W) to a scalar",
     )
     loss: Literal["l1", "l2", "l1+ssim"] = Field("l2", description="l1+ssim: L1 + 0.1 (1 - SSIM), as Image-GS")
-    optimizer: Literal["gaussian-adam", "adan", "adam"] = Field(
+    optimizer: Literal["gaussian-adam", "adan", "adam"] | Callable[[GaussianField], Any] = Field(
         "gaussian-adam",
         description="gaussian-adam: Adam in each Gaussian's own frame; adan: as GaussianImage; adam: as Image-GS; each "
-        "has its own parameters and learning rates",
+        "has its own parameters and learning rates; or a function from a field to an optimizer like GaussianAdam",
     )
     learning_rate_factor: float = Field(1.0, gt=0.0, description="factor on all learning rates of the optimizer")
     min_sigma: float = Field(
@@ -171,7 +175,7 @@ def available_recipes() -> list[str]:
 def _first(error: ValidationError) -> Exception:
     """Return the first of pydantic's errors as one of ours."""
     detail = error.errors()[0]
-    name = ".".join(map(str, detail["loc"]))
+    name = ".".join(map(str, detail["loc"][:1]))  # without the branches of a union
     if detail["type"] == "extra_forbidden":
         near = get_close_matches(name, FitConfig.model_fields, 1)
         hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(FitConfig.model_fields)}"

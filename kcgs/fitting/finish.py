@@ -5,15 +5,16 @@ from __future__ import annotations
 import torch
 
 from kcgs.kernels import settle
+from kcgs.optim.gaussians import Gaussians
 from kcgs.pruning import prune
 
-from .descent import is_finite, render
-from .log import log, take_up
+from .divergence import is_finite
+from .events import EndDrafts
+from .events.log import measure, take_up
 from .region_report import report_regions
 from .removal import remove_gaussians
 from .result import FitResult, StopReason
 from .state import FitState
-from .strategies import EndDrafts
 
 
 def finish(state: FitState, reason: StopReason, seconds: float) -> FitResult:
@@ -21,14 +22,15 @@ def finish(state: FitState, reason: StopReason, seconds: float) -> FitResult:
     problem, config = state.problem, state.problem.config
     take_up(state, wait=True)
     settle(problem.image.device, problem.size)
-    best_draft = None if state.cutoff == config.cutoff else state.best
-    EndDrafts().apply(state)
+    best_draft = state.best if state.is_draft else None
+    EndDrafts().act(state)
     with torch.no_grad():
         if best_draft is not None:
-            log(state, render(state, best_draft), seconds, best_draft)
-        if reason != "diverged" and is_finite(state.scene.field):
+            canvas = state.canvas._replace(regions=best_draft.regions)
+            measure(state, best_draft, canvas.render(Gaussians.of(best_draft.field)), seconds)
+        if reason != "diverged" and is_finite(state.field):
             remove_gaussians(state, state.num_gaussians - problem.num_gaussians)
-            log(state, render(state), seconds)
+            measure(state, state.scene, state.render(), seconds)
     take_up(state, wait=True)
     assert state.best is not None
     scene, num_pruned, prune_error = state.best, 0, 0.0

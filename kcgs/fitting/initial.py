@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,14 +13,9 @@ from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 
 from .problem import check_image_and_regions, check_num_gaussians
-from .sampling import sample_pixels
 
 # sum of the weights of Gaussians of half the spacing at a pixel
-_OVERLAP = math.pi / 2
-# share of the gradient in the density of Image-GS's centres; the rest is uniform
-_GRADIENT_SHARE = 0.7
-# pixels: thinner Gaussians would fall between the pixel centres
-_MIN_SIGMA = 0.5
+OVERLAP = math.pi / 2
 
 
 def initial_field(
@@ -60,7 +54,7 @@ def uniform_field(image: Tensor, num_gaussians: int, regions: RegionMap | None, 
     """Scatter round Gaussians uniformly over the image, in its colours: `initial_field` without its checks."""
     field = random_field(image, num_gaussians, regions, seed)
     x, y = field.means.detach().long().unbind(-1)
-    field.colors.data = (image[:, y, x].T / _OVERLAP).contiguous()
+    field.colors.data = (image[:, y, x].T / OVERLAP).contiguous()
     return field
 
 
@@ -102,22 +96,3 @@ def _fill_empty_regions(field: GaussianField, regions: RegionMap, seed: int) -> 
         index[row] = region
         counts[donor] -= 1
         counts[region] += 1
-
-
-def gradient_field(image: Tensor, num_gaussians: int, regions: RegionMap | None, seed: int) -> GaussianField:
-    """Sample centres where the image changes, as Image-GS does: 0.7 Sobel gradient magnitude + 0.3 uniform."""
-    from scipy.ndimage import sobel
-
-    rng = np.random.default_rng(seed)
-    planes = image.detach().cpu().double().numpy()
-    slope = np.sqrt(sum(sobel(planes, axis) ** 2 for axis in (1, 2)).mean(0)).ravel()
-    share = _GRADIENT_SHARE if slope.any() else 0.0
-    density = share * slope / max(slope.sum(), 1e-300) + (1 - share) / slope.size
-    pixels = sample_pixels(density, num_gaussians, rng)
-    centres = np.stack([pixels % planes.shape[2], pixels // planes.shape[2]], -1) + 0.5
-    sigma = np.maximum(0.5 / np.sqrt(num_gaussians * density[pixels]), _MIN_SIGMA)
-    colors = planes.reshape(len(planes), -1).T[pixels] / _OVERLAP
-    cholesky = np.stack([sigma, np.zeros_like(sigma), sigma], -1)
-    tensors = (torch.from_numpy(values).to(image) for values in (centres, cholesky, colors))
-    field = GaussianField(*tensors, size=(image.shape[1], image.shape[2]))
-    return field if regions is None else field.assign_regions(regions)

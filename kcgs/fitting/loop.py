@@ -1,13 +1,11 @@
-"""The fit: start, then strategies, render, log, backward and step, until something stops it."""
+"""The fit: a start, a descent with its events, and an end."""
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
-from contextlib import nullcontext
 from functools import lru_cache
-from typing import Any
+from typing import Any, cast
 
 import torch
 
@@ -15,27 +13,23 @@ from kcgs._progress import Progress
 from kcgs._warn import warn_user
 from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
-from kcgs.kernels import prepare, settle, without_waiting
+from kcgs.kernels import prepare
+from kcgs.optim.run import End, Event, run
 
-from .captured import CapturedStep, is_capturable
-from .checkpoint import Checkpoint
-from .clock import Clock
+from .clock import Clock, EndOfTime
 from .config import FitConfig
-from .descent import backward, has_diverged, render
+from .divergence import StopAtDivergence
+from .events.checkpoint import Checkpoint
+from .events.log import Log
 from .finish import finish
-from .log import log, log_is_due, take_up
-from .optimizers import set_learning_rates
+from .methods import method_of
 from .problem import Problem, make_problem
-from .result import FitResult, HistoryEntry, StopReason
+from .report import OnStep, Report
+from .result import FitResult, StopReason
+from .schedule import make_schedule
 from .search import search
 from .start import start
 from .state import FitState
-from .strategies import make_strategies
-
-OnStep = Callable[[int, HistoryEntry], bool | None]
-
-# at the start of a fit on a device that wait for it, since Gaussians may grow faster than the room for their lists
-_CHECKED_ITERATIONS = 20
 
 
 @torch.inference_mode(False)
@@ -51,6 +45,8 @@ def fit(
     progress: bool = False,
     checkpoint: str | os.PathLike[str] | None = None,
     resume: bool = False,
+    size: tuple[int, int] | None = None,
+    channels: int = 3,
     **settings: Any,
 ) -> FitResult:
     r"""Fit Gaussians to an image.
@@ -61,9 +57,15 @@ def fit(
     scene holds fewer than N Gaussians where the recipe prunes, or its target takes fewer. With `target_psnr` several
     fits search for the fewest Gaussians that reach it; `on_step` counts the iterations of each.
 
+    `objective` may be a loss of your own, such as one of Kornia's: a function from a render, :math:`(1, C, H, W)`, not
+    clipped, to a scalar, through which autograd goes. The history's `loss` is then this loss, and the scene of the
+    lowest is returned. Gaussians are added where the render differs from the image, and contours move to it; without an
+    image they are added where the loss has its slope, contours stay, and PSNR is NaN.
+
     Args:
         image: Tensor :math:`(C, H, W)` or :math:`(1, C, H, W)`, floating, values in [0, 1]; a numpy array
             :math:`(H, W, C)`, uint8 or floating; a PIL image; or a path, as :func:`kcgs.data.load_image` reads it.
+            None with a loss of your own that does not need it.
         regions: label map of the image's size: a Tensor or a numpy array, integer or bool, a PIL image, or a path, as
             :func:`kcgs.data.load_labels` reads it; or a RegionMap. EF-PSNR is measured along its contours. None: one
             region.
@@ -77,7 +79,10 @@ def fit(
         progress: show a bar, on a terminal or in a notebook.
         checkpoint: a file to write the state to from time to time, whole or not at all.
         resume: go on from `checkpoint` where it exists; the result is that of an uninterrupted fit.
-        settings: fields of :class:`FitConfig`, in place of the recipe's.
+        size: (height, width) of the render, without an image.
+        channels: C, without an image.
+        settings: fields of :class:`FitConfig`, in place of the recipe's. An event that adds Gaussians, or a function
+            from a field to an optimizer, may stand for the name of one.
 
     Returns:
         The scene (its contours moved, its regions merged, where the recipe does so), history, why it stopped, settings,
@@ -86,7 +91,9 @@ def fit(
     Raises:
         TypeError: wrong types.
         ValueError: an image that is not finite or not in [0, 1], regions of another size, N below 1 or
-            above the number of pixels, unknown recipe or setting, a checkpoint that is damaged or of another fit.
+            above the number of pixels, unknown recipe or setting, a checkpoint that is damaged or of another fit, or
+            one of a fit with functions of your own, which no file keeps; no image and no size; a loss that is no scalar
+            or does not depend on the render.
         OSError: a checkpoint that cannot be written; raised before the fit.
 
     Example:
@@ -97,9 +104,12 @@ def fit(
         (True, 2)
     """
     config = FitConfig.from_recipe(recipe, **settings)
-    problem = make_problem(image, regions, num_gaussians, config, seed)
+    problem = make_problem(image, regions, num_gaussians, config, seed, size, channels)
     if resume and checkpoint is None:
         raise InvalidArgument("checkpoint", "a file to go on from, with resume", None)
+    own = [name for name in ("objective", "densify", "optimizer") if not isinstance(getattr(config, name), str)]
+    if own and checkpoint is not None:
+        raise InvalidArgument("checkpoint", f"None with {own[0]} of your own, which no file keeps", repr(checkpoint))
     if config.target_psnr is not None and checkpoint is not None:
         raise InvalidArgument("checkpoint", "None with target_psnr, which takes several fits", repr(checkpoint))
     return fit_problem(problem, on_step, progress, checkpoint, resume)
@@ -112,7 +122,9 @@ def precompile(config: FitConfig, device: torch.device | str = "cpu") -> None:
     image = torch.stack([ramp.expand(64, 96), 1 - ramp.expand(64, 96), (8 * ramp).sin().square().expand(64, 96)])
     labels = (ramp > 0.6).long().expand(64, 96).contiguous()
     iterations = min(config.usual_iterations, 20)
-    update = {"iterations": iterations, "max_seconds": None, "target_psnr": None, "backend": "auto"}
+    update: dict[str, Any] = {"iterations": iterations, "max_seconds": None, "target_psnr": None, "backend": "auto"}
+    if callable(config.objective):  # it may be of one size
+        update["objective"] = "auto"
     fit(image, labels, 24, recipe=config.model_copy(update=update))
 
 
@@ -122,8 +134,9 @@ def fit_problem(
     progress: bool = False,
     checkpoint: str | os.PathLike[str] | None = None,
     resume: bool = False,
+    until: float = 1.0,
 ) -> FitResult:
-    """Solve a problem whose arguments are checked: see `fit`, which brings autograd's modes."""
+    """Solve a problem whose arguments are checked, up to a share of its schedule: see `fit`."""
     if problem.config.max_seconds is not None:
         precompile(problem.config, problem.image.device)
     prepare(problem.config.backend, problem.image.device, problem.image.dtype, len(problem.image))
@@ -137,59 +150,30 @@ def fit_problem(
             state, seconds = store.read()
             return _run(state, Clock(seconds), bar, on_step, store)
         clock = Clock()
-        return _run(start(problem), clock, bar, on_step, store)
+        return _run(start(problem), clock, bar, on_step, store, until)
 
 
 def _run(
-    state: FitState, clock: Clock, bar: Progress, on_step: OnStep | None, store: Checkpoint | None = None
+    state: FitState,
+    clock: Clock,
+    bar: Progress,
+    on_step: OnStep | None,
+    store: Checkpoint | None = None,
+    until: float = 1.0,
 ) -> FitResult:
     """Take a fit from its state to its end."""
-    problem, config = state.problem, state.problem.config
+    config = state.problem.config
     limit, max_seconds = config.max_iterations, config.max_seconds or math.inf
-    strategies = make_strategies(config)
-    reason: StopReason = "iterations"
-    first, captured = state.iteration, CapturedStep()
-    while state.iteration < limit:
-        state.progress = max(state.iteration / limit, clock.seconds() / max_seconds)
-        if has_diverged(state):
-            warn_user(f"the fit diverged at iteration {state.iteration}: the best so far is kept")
-            reason = "diverged"
-            break
-        for strategy in strategies:
-            if strategy.due(state):
-                strategy.apply(state)
-                state.waits = True
-        if state.waits:
-            settle(problem.image.device, problem.size)
-            captured.forget()
-        waits = state.waits or not state.runs_ahead or state.iteration < first + _CHECKED_ITERATIONS
-        replays = not waits and is_capturable(state)
-        set_learning_rates(state.optimizer, config, state.progress)
-        with nullcontext() if waits else without_waiting(), torch.set_grad_enabled(not replays):
-            rendered = None
-            if log_is_due(state, clock.seconds()):
-                rendered = render(state)
-                log(state, rendered, clock.seconds())
-            if replays:
-                captured(state)
-            else:
-                backward(state, rendered)
-                state.optimizer.step()
-        state.waits = False
-        state.iteration += 1
 
-        take_up(state, wait=False)
-        entry = state.history[-1]
-        bar.update(state.progress, f"iteration {state.iteration}, {entry.num_gaussians} Gaussians, {entry.psnr:.2f} dB")
-        if store is not None and (store.due() or state.iteration == limit):
-            store.write(state, clock.seconds())
-        if on_step is not None and on_step(state.iteration, entry):
-            reason = "callback"
-            break
-        if clock.seconds() >= max_seconds:
-            reason = "seconds"
-            break
-    return finish(state, reason, clock.seconds())
+    def progress() -> float:
+        return max(state.iteration / limit, clock.seconds() / max_seconds)
+
+    events: list[Event] = [
+        Report(state, clock, bar, on_step, store), EndOfTime(clock), End(until), StopAtDivergence(),
+        *make_schedule(config), Log(clock),
+    ]  # fmt: skip
+    reason = run(state, progress, events, method_of(config).rate)
+    return finish(state, cast(StopReason, reason), clock.seconds())
 
 
 def _warn_of_regions(problem: Problem) -> None:

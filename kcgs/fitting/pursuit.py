@@ -11,9 +11,16 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
+from kcgs._check import check_count, check_floating
+from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap, lookup_regions, region_splat
-from kcgs.kernels import takes_triton
+from kcgs.kernels import check_backend, takes_triton
 from kcgs.nn import GaussianField
+from kcgs.optim.gaussians import Canvas
+from kcgs.optim.ms_ssim import halve
+from kcgs.optim.objectives import Objective
+
+from .problem import regions_of
 
 # Standard deviations that are tried, in pixels, by the side of the blocks that the residual is averaged over for them.
 # More of them, and smaller blocks, cost time, and descent changes them anyway.
@@ -36,13 +43,50 @@ class _Scale(NamedTuple):
     colors: Tensor  # [C, h, w], of least squares
 
 
-def propose(residual: Tensor, regions: RegionMap | None, count: int, *, backend: str = "auto") -> GaussianField:
-    r"""Find at most `count` round Gaussians that lower the squared error when they are added to the render.
+def propose_gaussians(
+    error: Tensor, num_gaussians: int, regions: RegionMap | Tensor | None = None, *, backend: str = "auto"
+) -> GaussianField:
+    r"""Find the Gaussians to add to a render, for :meth:`kcgs.optim.GaussianAdam.append`.
 
-    Alone, a Gaussian g lowers it by :math:`\sum_c \langle g, e_c \rangle^2 / \langle g, g \rangle`, with products over
-    pixels of its region. A round adds the strongest local maxima of this gain over places and sizes; the next one
-    begins with the error that is left. Nothing is sampled at random. The strongest of each round come first.
+    Convention: they are round, and lower the squared error most. Alone, a Gaussian g lowers it by
+    :math:`\sum_c \langle g, e_c \rangle^2 / \langle g, g \rangle`, with products over pixels of its region. A round
+    adds the strongest local maxima of this gain over places and sizes; the next one begins with the error that is left.
+    Nothing is sampled at random. The strongest of each round come first.
+
+    Args:
+        error: image - render, :math:`(C, H, W)` or :math:`(1, C, H, W)`, floating.
+        num_gaussians: how many to find, at least 1; there are fewer where no others lower the error.
+        regions: the RegionMap or label map of the render, of the error's size; each Gaussian gets the region under its
+            centre. None: Gaussians are not confined.
+        backend: as in :func:`kcgs.functional.region_splat`.
+
+    Returns:
+        A field, without a graph.
+
+    Raises:
+        TypeError: an error that is no floating Tensor, or a number that is not whole.
+        ValueError: an error of another shape or that is not finite, a number below 1, a map of another size.
+
+    Example:
+        >>> from kcgs.functional import region_splat
+        >>> means, cholesky, colors = torch.tensor([[9.0, 7.0]]), torch.tensor([[1.8, 0.0, 1.8]]), torch.ones(1, 3)
+        >>> error = region_splat(means, cholesky, colors, size=(16, 24))
+        >>> propose_gaussians(error, 1).means.detach()
+        tensor([[9., 7.]])
+
+    Source: Mallat and Zhang, "Matching Pursuits with Time-Frequency Dictionaries", 1993, many atoms in a round.
     """
+    error = check_floating("error", error, dims=(3, 4)).detach()
+    if error.ndim == 4 and len(error) > 1:
+        raise InvalidArgument("error", "of one image", tuple(error.shape))
+    error = error.reshape(error.shape[-3:]).to(torch.promote_types(error.dtype, torch.float32))
+    map_of_error = regions_of(tuple(error.shape[1:]), regions)
+    count = check_count("num_gaussians", num_gaussians)
+    return propose(error.contiguous(), map_of_error, count, backend=check_backend(backend))
+
+
+def propose(residual: Tensor, regions: RegionMap | None, count: int, *, backend: str = "auto") -> GaussianField:
+    """Do what `propose_gaussians` does, with arguments that are checked; `count` may be 0."""
     residual = residual.detach()
     # below this the gain is rounding error: one pixel's, at the precision of the largest
     floor = (128 * torch.finfo(residual.dtype).eps * float(residual.abs().max())) ** 2
@@ -69,6 +113,16 @@ def propose(residual: Tensor, regions: RegionMap | None, count: int, *, backend:
             residual, missing = torch.addcmul(residual, rendered, length, value=-1.0), missing - len(means)
     means, cholesky, colors = (torch.cat(rows) for rows in zip(*parts, strict=True))
     return GaussianField(means, cholesky, colors, torch.cat(region_ids) if region_ids else None, size=size)
+
+
+def propose_for(objective: Objective, rendered: Tensor, canvas: Canvas, count: int) -> GaussianField:
+    """Find at most `count` Gaussians that lower an objective of a render, (C, H, W), most: see `propose`."""
+    error, root = objective.residual(rendered)
+    added = propose(error, canvas.regions, count, backend=canvas.backend)
+    if isinstance(root, Tensor):
+        x, y = added.means.detach().long().unbind(-1)
+        added.colors.data = added.colors.detach() / root[y, x, None]
+    return added
 
 
 def _local_maxima(residual: Tensor, regions: RegionMap | None, floor: float) -> tuple[Tensor, ...]:
@@ -177,9 +231,3 @@ def _halve_by_maximum(plane: Tensor) -> Tensor:
     plane = pad(plane, [0, plane.shape[1] % 2, 0, plane.shape[0] % 2])
     rows = torch.maximum(plane[::2], plane[1::2])
     return torch.maximum(rows[:, ::2], rows[:, 1::2])
-
-
-def halve(planes: Tensor) -> Tensor:
-    """Average blocks of 2 x 2, (..., h, w), without an odd last row; five times faster on one core than torch's."""
-    rows = planes[..., : planes.shape[-2] // 2 * 2 : 2, :] + planes[..., 1::2, :]
-    return (rows[..., : rows.shape[-1] // 2 * 2 : 2] + rows[..., 1::2]).mul_(0.25)

@@ -3,43 +3,83 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from kcgs.functional.weights import inner_products
+from kcgs._check import check_count
+from kcgs.errors import InvalidArgument, InvalidArgumentType
+from kcgs.functional import RegionMap
+from kcgs.kernels import check_backend
+from kcgs.nn import GaussianField
+from kcgs.optim.gaussians import Canvas, Gaussians, draft_cutoff
 
-from .descent import DRAFT_CUTOFF
+from .problem import regions_of
 from .state import FitState
 
 
-@torch.no_grad()
-def lowest_impact(
-    products: Callable[[Tensor, Tensor], Tensor],
-    cholesky: Tensor,
-    colors: Tensor,
-    count: int,
-    weight: Tensor,
-) -> tuple[Tensor, Tensor]:
-    r"""Choose Gaussians to remove, and give their colours to the others.
+class Removal(NamedTuple):
+    """Gaussians to remove."""
 
-    The impact of Gaussian i is :math:`|c_i|^2 \langle g_i, g_i \rangle / (1 + \sum_j o_{ij})`. The overlap
+    mask: Tensor
+    """Those to remove, boolean (N)."""
+    colors: Tensor
+    """Colours of all, (N, C), with which the others stand in for them."""
+
+
+def lowest_impact(
+    field: GaussianField, num_gaussians: int, regions: RegionMap | Tensor | None = None, *, backend: str = "auto"
+) -> Removal:
+    r"""Find the Gaussians that cost least to remove, for :meth:`kcgs.optim.GaussianAdam.keep`.
+
+    Convention: the impact of Gaussian i is :math:`|c_i|^2 \langle g_i, g_i \rangle / (1 + \sum_j o_{ij})`. The overlap
     :math:`o_{ij}` is the normalised inner product of two Gaussians of half the covariances: 1 for twins, and near 0 for
     distant ones. Only the half of the Gaussians with more energy count as j, for others may be removed as well. The
     other colours take one gradient step towards the render of what is removed, scaled by each one's energy and
     overlaps, and of the best length.
 
     Args:
-        products: from cholesky and colors to the inner products of the Gaussians and their render, (N, C).
-        cholesky: (N, 3).
-        colors: (N, C).
-        count: how many to remove.
-        weight: (N,), the weight of the squared error about each one.
+        field: N Gaussians of one image, without opacities.
+        num_gaussians: how many to remove, from 0 to N.
+        regions: the RegionMap or label map of the field's size, if Gaussians are confined.
+        backend: as in :func:`kcgs.functional.region_splat`.
 
     Returns:
-        A mask of those to remove, (N,), and the colours of all, (N, C).
+        A mask of those to remove, and the colours of all.
+
+    Raises:
+        TypeError: no field, or a number that is not whole.
+        ValueError: a field that is batched or has opacities, a number above N, a map of another size, or a map for
+            Gaussians without ids.
+
+    Example:
+        >>> field = GaussianField.random(20, (16, 24), seed=0)
+        >>> mask, colors = lowest_impact(field, 5)
+        >>> int(mask.sum()), colors.shape
+        (5, torch.Size([20, 3]))
     """
+    if not isinstance(field, GaussianField):
+        raise InvalidArgumentType("field", "a GaussianField", type(field).__name__)
+    if field.means.ndim != 2 or field.opacities is not None:
+        received = f"means {tuple(field.means.shape)}" if field.opacities is None else "opacities"
+        raise InvalidArgument("field", "of one image, without opacities", received)
+    map_of_field = regions_of(field.size, regions)
+    if (map_of_field is None) != (field.region_ids is None):
+        raise InvalidArgument("regions", "given where the field has region ids, and only there", regions)
+    count = check_count("num_gaussians", num_gaussians, 0, field.num_gaussians)
+    gaussians, canvas = Gaussians.of(field), Canvas(field.size, map_of_field, backend=check_backend(backend))
+    return least_impact(canvas, gaussians, count, torch.ones_like(gaussians.means[:, 0]))
+
+
+@torch.no_grad()
+def least_impact(canvas: Canvas, gaussians: Gaussians, count: int, weight: Tensor) -> Removal:
+    """Do what `lowest_impact` does, by a weight of the squared error of each Gaussian, (N,)."""
+    _, cholesky, colors, _ = gaussians
+
+    def products(cholesky: Tensor, colors: Tensor) -> Tensor:
+        return canvas.inner_products(gaussians._replace(cholesky=cholesky, colors=colors))
+
     area = math.pi * cholesky[:, :1] * cholesky[:, 2:]
     energy = weight * colors.square().sum(1) * area[:, 0]
     is_strong = torch.ones_like(energy, dtype=torch.bool)
@@ -54,7 +94,7 @@ def lowest_impact(
     # inner products of the step's render, with what is removed and with itself
     tiny = torch.finfo(step.dtype).tiny
     length = (step * removed_products).sum() / (step * products(cholesky, step)).sum().clamp_min(tiny)
-    return removed, colors + length * step
+    return Removal(removed, colors + length * step)
 
 
 @torch.no_grad()
@@ -62,16 +102,8 @@ def remove_gaussians(state: FitState, count: int) -> None:
     """Remove so many Gaussians, if any, those with the lowest impact."""
     if count <= 0:
         return
-    field, problem = state.scene.field, state.problem
-    means, cholesky, colors = field.means.detach(), field.cholesky.detach(), field.colors.detach()
-
-    def products(cholesky: Tensor, colors: Tensor) -> Tensor:
-        return inner_products(
-            means, cholesky, colors, field.region_ids, state.scene.regions,
-            size=problem.size, cutoff=DRAFT_CUTOFF, backend=problem.config.backend,
-        )  # fmt: skip
-
-    weight = torch.ones_like(means[:, 0]) if problem.objective is None else problem.objective.weigh(means, cholesky)
-    removed, new_colors = lowest_impact(products, cholesky, colors, count, weight)
-    colors.copy_(new_colors)
-    state.optimizer.keep(field, ~removed)
+    gaussians, cutoff = Gaussians.of(state.field), draft_cutoff(state.problem.config.cutoff)
+    canvas, weight = state.canvas._replace(cutoff=cutoff), state.objective.weigh(gaussians)
+    removed, colors = least_impact(canvas, gaussians, count, weight)
+    state.field.colors.data.copy_(colors)
+    state.optimizer.keep(state.field, ~removed)

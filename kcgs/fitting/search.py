@@ -17,12 +17,14 @@ import torch
 from kcgs.functional import psnr
 
 from .clock import Clock
+from .events import Densify
+from .methods import method_of
 from .problem import Problem
 from .removal import remove_gaussians
 from .result import FitResult
-from .start import draft_cutoff, start
+from .schedule import make_densify
+from .start import make_state, start
 from .state import FitState
-from .strategies import make_densify
 
 # pixels per Gaussian of the first fit
 _FIRST_SPACING = 256
@@ -79,26 +81,31 @@ def _fit(problem: Problem, count: int, trials: list[_Trial], seconds: float, run
     settings = config.model_copy(update=changes)
     nearest = min(trials, key=lambda t: abs(math.log(t.num_gaussians / count)), default=None)
     problem = replace(problem, num_gaussians=count, config=settings)
-    if nearest is None or config.optimizer != "gaussian-adam" or nearest.result.stop_reason == "diverged":
+    densify = make_densify(settings)
+    if (
+        nearest is None
+        or nearest.result.stop_reason == "diverged"
+        or not isinstance(densify, Densify)
+        or not method_of(config).has_drafts
+    ):
         state = start(problem)
     else:
-        state = _warm_start(problem, nearest.state)
+        state = _warm_start(problem, nearest.state, densify)
     result = run(state)
     return _Trial(count, float(psnr(result.scene.render().to(problem.image), problem.image)), result, state)
 
 
-def _warm_start(problem: Problem, finished: FitState) -> FitState:
+def _warm_start(problem: Problem, finished: FitState, densify: Densify) -> FitState:
     """Return the state of a fit that goes on from another with some Gaussians more or fewer."""
-    scene, optimizer = copy.deepcopy((finished.scene, finished.optimizer))
-    count = problem.num_gaussians
-    state = FitState(
-        problem, scene, optimizer, finished.anchor, draft_cutoff(problem.config), num_initial=count,
-        num_requested=count, iteration=round(_WARM_START * problem.config.usual_iterations),
-        num_additions=finished.num_additions,
+    count, field = problem.num_gaussians, copy.deepcopy(finished.field)
+    state = make_state(
+        problem, field, finished.regions, count, anchor=finished.anchor, num_additions=finished.num_additions,
+        iteration=round(_WARM_START * problem.config.usual_iterations),
     )  # fmt: skip
+    state.optimizer.load_state_dict(copy.deepcopy(finished.optimizer.state_dict()))
     remove_gaussians(state, state.num_gaussians - count)
     with torch.no_grad():
-        make_densify(problem.config).add(state, count - state.num_gaussians)
+        densify.add(state, count - state.num_gaussians)
     return state
 
 

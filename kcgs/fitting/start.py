@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from torch import Tensor
 
 from kcgs.functional import RegionMap, choose_softness
 from kcgs.functional.merging import pairs_to_merge
-from kcgs.scene import Scene
+from kcgs.nn import GaussianField
+from kcgs.optim.gaussians import Canvas, draft_cutoff
 
 from .config import FitConfig
-from .descent import DRAFT_CUTOFF
-from .initial import gradient_field, initial_sigma, random_field, uniform_field
-from .optimizers import make_optimizer
+from .initial import initial_sigma, random_field, uniform_field
+from .methods import method_of
 from .problem import Problem
+from .published.gradient_start import gradient_field
 from .state import FitState
 
 _INITIALIZERS = {"uniform": uniform_field, "random": random_field, "gradient": gradient_field}
+# of every value, where Gaussians start without an image
+_GREY = 0.5
 
 
 def start(problem: Problem) -> FitState:
@@ -26,21 +30,25 @@ def start(problem: Problem) -> FitState:
     regions = _regions_to_render(image, _as_many_as_gaussians(problem), config)
     share = math.ceil(config.densify_from * problem.num_gaussians)
     count = min(problem.num_gaussians, max(1 if regions is None else regions.num_regions, share))
-    field = _INITIALIZERS[config.initializer](image, count, regions, problem.seed)
+    field = _INITIALIZERS[config.initializer](image.nan_to_num(_GREY), count, regions, problem.seed)
+    return make_state(problem, field, regions, count, anchor=regions)
+
+
+def make_state(
+    problem: Problem, field: GaussianField, regions: RegionMap | None, num_initial: int, **progress: Any
+) -> FitState:
+    """Return the state of a fit of a field that began with so many Gaussians."""
+    config, method = problem.config, method_of(problem.config)
+    cutoff = draft_cutoff(config.cutoff) if method.has_drafts else config.cutoff
     return FitState(
-        problem,
-        Scene(field, regions),
-        make_optimizer(config, field, initial_sigma(problem.size, count)),
-        anchor=regions,
-        cutoff=draft_cutoff(config),
-        num_initial=count,
-        num_requested=count,
+        field,
+        method.make_optimizer(config, field, initial_sigma(problem.size, num_initial)),
+        problem.objective,
+        Canvas(problem.size, regions, cutoff, config.backend, problem.bounds),
+        problem=problem,
+        num_initial=num_initial,
+        **{"num_requested": num_initial, **progress},
     )
-
-
-def draft_cutoff(config: FitConfig) -> float:
-    """Return the cutoff of most of a fit."""
-    return max(config.cutoff, DRAFT_CUTOFF) if config.optimizer == "gaussian-adam" else config.cutoff
 
 
 def _as_many_as_gaussians(problem: Problem) -> RegionMap | None:

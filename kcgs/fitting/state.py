@@ -1,19 +1,28 @@
-"""The state of a fit: plain data, which the loop and the strategies read and change."""
+"""The state of a fit: a descent, and what events read and change."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import torch
+
 from kcgs.functional import RegionMap
+from kcgs.kernels import settle, without_waiting
 from kcgs.optim import GaussianAdam
+from kcgs.optim.descent import FieldDescent
 from kcgs.scene import Scene
 
-from .optimizers import GaussianOptimizer
+from .captured import CapturedStep
 from .problem import Problem
 from .readback import Readback
 from .result import HistoryEntry
+
+# at the start of a fit on a device that wait for it, since Gaussians may grow faster than the room for their lists
+_CHECKED_ITERATIONS = 20
 
 
 class Measurement(NamedTuple):
@@ -25,28 +34,17 @@ class Measurement(NamedTuple):
     errors: Readback
 
 
-@dataclass
-class FitState:
-    """A fit in progress: the start fills it, strategies change it, a checkpoint keeps it."""
+@dataclass(kw_only=True)
+class FitState(FieldDescent):
+    """A fit in progress: the start fills it, events change it, a checkpoint keeps it."""
 
     problem: Problem
-    scene: Scene
-    """What is rendered: the field that the optimizer moves, and the map, which strategies replace."""
-    optimizer: GaussianOptimizer
     anchor: RegionMap | None
     """The map that contours may not move far from."""
-    cutoff: float
-    """Weights below it are skipped: first a draft's, at the end the result's."""
     num_initial: int
     """Gaussians at the start."""
     num_requested: int
-    """Gaussians that the strategies last asked for; fewer exist where fewer were of use.
-
-    A strategy that removes Gaussians lowers it: then `Densify`, after it in the list, adds as many elsewhere.
-    """
-    progress: float = 0.0
-    """Share of the fit that is over: of its iterations or of its seconds, whichever is more."""
-    iteration: int = 0
+    """Gaussians that the schedule last asked for; fewer exist where fewer were of use."""
     num_additions: int = 0
     """How often Gaussians were added."""
     num_late_moves: int = 0
@@ -60,13 +58,27 @@ class FitState:
     """The next step waits for the device, to learn how much room the Gaussians take."""
     best: Scene | None = None
     """A copy of the best scene that was measured."""
-    best_score: float = -math.inf
-    """Its PSNR in dB, or what the objective has in its place."""
+    best_value: float = math.inf
+    """Its squared error, or what the objective has in its place."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._first, self._captured = self.iteration, CapturedStep()
+
+    @property
+    def scene(self) -> Scene:
+        """The field that the optimizer moves, and the map."""
+        return Scene(self.field, self.regions)
 
     @property
     def num_gaussians(self) -> int:
         """Gaussians at the moment."""
-        return self.scene.num_gaussians
+        return self.field.num_gaussians
+
+    @property
+    def is_draft(self) -> bool:
+        """True where the cutoff is not yet that of the result."""
+        return self.canvas.cutoff != self.problem.config.cutoff
 
     @property
     def runs_ahead(self) -> bool:
@@ -83,3 +95,36 @@ class FitState:
         if config.max_seconds is None:
             return config.usual_iterations
         return self.iteration / max(self.progress, 1e-9)
+
+    @property
+    def is_settled(self) -> bool:
+        """True where a render need not wait for the device."""
+        return self.runs_ahead and not self.waits and self.iteration >= self._first + _CHECKED_ITERATIONS
+
+    @property
+    def replays(self) -> bool:
+        """True where the next step is a kernel's programs alone, on a GPU, which a CUDA graph replays."""
+        return self.is_settled and self.field.means.is_cuda and self.objective.takes_one_pass(self.canvas)
+
+    @contextmanager
+    def room(self) -> Iterator[None]:
+        """Render without waiting for the device, where that is possible, and without a graph that no step needs."""
+        with without_waiting() if self.is_settled else nullcontext(), torch.set_grad_enabled(not self.replays):
+            yield
+
+    def step(self, rate: float) -> None:
+        """Move the field once."""
+        if self.waits:
+            settle(self.problem.image.device, self.problem.size)
+            self._captured.forget()
+        super().step(rate)
+        self.waits = False
+
+    def move(self) -> None:
+        """Take a step, or replay one."""
+        with self.room():
+            if self.replays:
+                self.rendered = None
+                self._captured(self)
+            else:
+                super().move()

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from .frame import local_gradient, move, widen
+from .gaussians import Gaussians
 
 # half the second derivatives of the squared error by a step in a Gaussian's frame, per energy of the Gaussian: two of
 # the centre, three of the factor (docs/format.md has the derivation)
@@ -26,25 +25,7 @@ _MAX_STEP = 0.2
 _MOMENTUM = 0.9
 
 
-class Gaussians(NamedTuple):
-    """The parameters that a descent moves, or a gradient by each of them."""
-
-    means: Tensor  # [N, 2]
-    cholesky: Tensor  # [N, 3]
-    colors: Tensor  # [N, C]
-
-
-class Objective(Protocol):
-    """An error of a render that is about quadratic, such as the fit's for MS-SSIM."""
-
-    def apply(self, residual: Tensor) -> Tensor:
-        """Return half the gradient at a residual, render - image, (C, H, W), in whose memory it may be."""
-
-    def weigh(self, means: Tensor, cholesky: Tensor) -> Tensor:
-        """Return what the squared error of each Gaussian weighs in the objective, (N,)."""
-
-
-class NewtonDescent:
+class Newton:
     """Newton steps of every number alone, in each Gaussian's frame, with momentum.
 
     A number with a small gradient hardly moves, while Adam moves all numbers about as far.
@@ -56,7 +37,7 @@ class NewtonDescent:
     """
 
     def __init__(self, gaussians: Gaussians, *, exact: bool = True, min_sigma: float = 0.0) -> None:
-        self.velocity = torch.zeros_like(torch.cat(gaussians, -1))  # [N, 5 + C]
+        self.velocity = torch.zeros_like(torch.cat(gaussians[:3], -1))  # [N, 5 + C]
         self.exact, self.min_sigma = exact, min_sigma
 
     def step(
@@ -76,15 +57,14 @@ class NewtonDescent:
             rate: share of a Newton step.
             frozen: numbers that do not move, bool, (N, 5 + C) or what broadcasts to it.
         """
-        means, cholesky, colors = gaussians
         self.velocity = _MOMENTUM * self.velocity + _newton_step(gaussians, gradients, color_curvature)
         if frozen is not None:
             self.velocity = torch.where(frozen, 0.0, self.velocity)
         step = rate * self.velocity
-        means, cholesky = move(means, cholesky, step[:, :5].clamp(-_MAX_STEP, _MAX_STEP), exact=self.exact)
+        means, cholesky = move(*gaussians[:2], step[:, :5].clamp(-_MAX_STEP, _MAX_STEP), exact=self.exact)
         if self.min_sigma > 0.0:
             cholesky = widen(cholesky, self.min_sigma)
-        return Gaussians(means, cholesky, colors + step[:, 5:])
+        return Gaussians(means, cholesky, gaussians.colors + step[:, 5:], gaussians.region_ids)
 
 
 def _newton_step(gaussians: Gaussians, gradients: Gaussians, color_curvature: Tensor) -> Tensor:
@@ -93,29 +73,6 @@ def _newton_step(gaussians: Gaussians, gradients: Gaussians, color_curvature: Te
     local = local_gradient(gaussians.cholesky, gradients.means, gradients.cholesky)
     geometry = (local / (energy[:, None] * energy.new_tensor(_CURVATURE))).clamp(-_MAX_NEWTON_STEP, _MAX_NEWTON_STEP)
     return -torch.cat([geometry, gradients.colors / color_curvature[:, None]], -1)
-
-
-def half_gradients(
-    renderer: Callable[[Tensor, Tensor, Tensor], Tensor],
-    gaussians: Gaussians,
-    image: Tensor,
-    objective: Objective | None,
-) -> Gaussians:
-    """Return half the gradients of the objective of a render, (C, H, W); without one, of the squared error."""
-    leaves = [t.detach().requires_grad_() for t in gaussians]
-    with torch.enable_grad():
-        render = renderer(*leaves)
-    residual = render.data.sub_(image)
-    if objective is not None:
-        residual = objective.apply(residual)
-    return Gaussians(*torch.autograd.grad(render, leaves, residual))
-
-
-def error_weights(gaussians: Gaussians, objective: Objective | None) -> Tensor:
-    """Return what the squared error of each Gaussian weighs in the objective, (N,)."""
-    if objective is None:
-        return torch.ones_like(gaussians.means[:, 0])
-    return objective.weigh(gaussians.means, gaussians.cholesky)
 
 
 def area(cholesky: Tensor) -> Tensor:

@@ -20,7 +20,6 @@ from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
 from kcgs.fitting import FitConfig, FitResult, HistoryEntry
 from kcgs.fitting.loop import fit_problem
-from kcgs.fitting.objective import make_objective
 from kcgs.fitting.problem import Problem, make_problem
 from kcgs.fitting.region_report import report_regions
 from kcgs.functional import RegionMap, edge_band, merge_regions
@@ -198,6 +197,8 @@ def fit_bytes(
         config = config.model_copy(update={"objective": "ms-ssim" if config.loss == "l2" else "psnr"})
     if config.target_psnr is not None:
         raise InvalidArgument("target_psnr", "None with target_bytes", config.target_psnr)
+    if callable(config.objective):
+        raise InvalidArgument("objective", "'psnr' or 'ms-ssim' with target_bytes", "a function")
     check_count("target_bytes", target_bytes, _MIN_BYTES)
     problem = make_problem(image, regions, 1, config, seed)
     with Progress("trial fits", pulse=True, visible=progress), threads_for_kernels(problem.image[0].numel()):
@@ -209,18 +210,22 @@ def fit_bytes(
     report = report_regions(problem.regions, scene, **choice.changes)
     with Progress("writing the file", pulse=True, visible=progress), threads_for_kernels(reduced.image[0].numel()):
         small = reduced.image.to("cpu", torch.float32)
-        objective = make_objective(config.objective, small, reduced.reduction)
+        objective = replace(reduced, image=small).objective
         min_sigma = _min_sigma(problem, choice.num_gaussians)
-        iterations = _shorten(BUDGETS[config.objective].compress_iterations, reduced.reduction)
-        compressor = Compressor(SceneWriter(scene), small, objective, iterations, seed, min_sigma)
+        iterations = _shorten(_budget(config).compress_iterations, reduced.reduction)
+        compressor = Compressor(SceneWriter(scene), objective, iterations, seed, min_sigma)
         data = compressor.search_bytes(target_bytes)
     return FitBytesResult(data, decode(data).scene, result._replace(scene=scene, regions=report))
+
+
+def _budget(config: FitConfig) -> GaussianBudget:
+    return BUDGETS[str(config.objective)]
 
 
 def _reduce(problem: Problem, choice: _RegionChoice) -> Problem:
     """Return the problem of the fit: without a map, of a photo that is as small as the least width allows."""
     config, (height, width) = problem.config, problem.size
-    budget, min_sigma = BUDGETS[config.objective], _min_sigma(problem, choice.num_gaussians)
+    budget, min_sigma = _budget(config), _min_sigma(problem, choice.num_gaussians)
     reduction = _reduction(min_sigma) if choice.regions is None else 1
     update: dict[str, Any] = {"contour_cost": choice.contour_cost, "min_sigma": min_sigma / reduction}
     if config.iterations is None and config.max_seconds is None:
@@ -235,7 +240,7 @@ def _reduce(problem: Problem, choice: _RegionChoice) -> Problem:
 def _min_sigma(problem: Problem, num_gaussians: int) -> float:
     """Return the least standard deviation of so many Gaussians, in pixels of the photo."""
     config, pixels = problem.config, problem.size[0] * problem.size[1]
-    return max(config.min_sigma, BUDGETS[config.objective].min_sigma(num_gaussians, pixels))
+    return max(config.min_sigma, _budget(config).min_sigma(num_gaussians, pixels))
 
 
 def _reduction(min_sigma: float) -> int:
@@ -259,7 +264,7 @@ def _enlarge(scene: Scene, size: tuple[int, int]) -> Scene:
 def _choose_regions(problem: Problem, target_bytes: int) -> _RegionChoice:
     """Merge regions whose contours do not pay for their bytes, then drop the map if it does not pay as a whole."""
     image, regions, config = problem.image, problem.regions, problem.config
-    num_gaussians = partial(BUDGETS[config.objective].num_gaussians, pixels=image.shape[1] * image.shape[2])
+    num_gaussians = partial(_budget(config).num_gaussians, pixels=image.shape[1] * image.shape[2])
     choice = _RegionChoice(None, num_gaussians(target_bytes), config.contour_cost, {})
     if not config.guidance:
         return choice._replace(changes={"dropped": "recipe"})
@@ -318,11 +323,5 @@ def _fit_share(
 ) -> FitResult:
     """Run the first share of a fit's schedule; all of it where a clock ends the fit."""
     config = problem.config
-    last = math.inf if config.max_seconds else math.ceil(share * config.usual_iterations)
-
-    def stop(iteration: int, entry: HistoryEntry) -> bool:
-        return (on_step is not None and bool(on_step(iteration, entry))) or iteration >= last
-
-    result = fit_problem(problem, stop, progress)
-    is_complete = result.history[-1].iteration >= last
-    return result._replace(stop_reason="iterations") if is_complete else result
+    until = 1.0 if config.max_seconds else math.ceil(share * config.usual_iterations) / config.usual_iterations
+    return fit_problem(problem, on_step, progress, until=until)

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, get_args
 
 import torch
-from torch import Tensor
 
 from kcgs._check import check_count, check_number
 from kcgs._image import as_image
@@ -18,12 +17,14 @@ from kcgs.codec.gaussians.quantize import QPS, Quantizer
 from kcgs.codec.scenes import QUALITIES, SceneWriter
 from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
-from kcgs.fitting.config import Objective
-from kcgs.fitting.objective import MsSsimObjective, make_objective
+from kcgs.fitting.config import ObjectiveName
 from kcgs.functional import psnr
+from kcgs.optim.ms_ssim import MsSsim
+from kcgs.optim.objectives import Objective, SquaredError
+from kcgs.optim.run import At, End, count_iterations, run
 from kcgs.scene import Scene
 
-from .descent import RateDistortionDescent
+from .descent import RATE, RateDistortionDescent
 from .rounding import round_gradually
 
 # dB of `quality` above the scene's PSNR at which rounding adds about a 28th to the squared error, 0.15 dB; it adds more
@@ -99,11 +100,12 @@ def compress(
             raise InvalidArgument("target_psnr", "None with quality or target_bytes", target_psnr)
     qp = writer.qp_for(quality, target_bytes)
     check_count("iterations", iterations)
-    if objective not in get_args(Objective):
-        raise InvalidArgument("objective", f"one of {', '.join(get_args(Objective))}", repr(objective))
+    if objective not in get_args(ObjectiveName):
+        raise InvalidArgument("objective", f"one of {', '.join(get_args(ObjectiveName))}", repr(objective))
     if objective == "auto":
         objective = "ms-ssim" if target_psnr is None else "psnr"
-    compressor = Compressor(writer, target, make_objective(objective, target), iterations, seed)
+    error = MsSsim(target) if objective == "ms-ssim" else SquaredError(target)
+    compressor = Compressor(writer, error, iterations, seed)
     with threads_for_kernels(target[0].numel()):
         if target_bytes is not None:
             data = compressor.search_bytes(target_bytes)
@@ -168,8 +170,7 @@ class Compressor:
     """Rate-distortion descent and gradual rounding of one scene, at any quantization parameter (QP)."""
 
     writer: SceneWriter
-    image: Tensor  # [C, h, w], the scene's size, or smaller
-    objective: MsSsimObjective | None
+    objective: Objective  # of an image of the scene's size, or smaller
     iterations: int
     seed: int
     min_sigma: float = 0.0
@@ -223,7 +224,7 @@ class Compressor:
         """Return the coarsest file that reaches `target_psnr`, or where the scene does not, the coarsest of all."""
         for step in _QUALITY_STEPS if scene_psnr >= target_psnr else _QUALITY_STEPS[:1]:
             data = self.write(self.writer.qp_for(quality_for(scene_psnr + step)))
-            if float(psnr(decode(data).scene.render(), self.image)) >= target_psnr:
+            if float(psnr(decode(data).scene.render(), self.objective.image)) >= target_psnr:
                 break
         return data
 
@@ -239,25 +240,28 @@ class Compressor:
         """
         writer, iterations = self.writer, self.descent_iterations
         descent = self._new_descent(writer)
-        for start in range(0, iterations, _SCHEDULE.update_interval):
+
+        def update() -> None:
+            nonlocal writer, qp
+            if descent.iteration:
+                writer = writer.with_gaussians(descent.parameters(), descent.ids)
             qp = update_qp(writer, qp)
-            quantizer = Quantizer(qp, writer.size)
-            if start >= _SCHEDULE.prune_from * iterations:
-                descent.prune(quantizer)
-            for _ in range(min(_SCHEDULE.update_interval, iterations - start)):
-                descent.step(quantizer)
-            writer = writer.with_gaussians(descent.parameters(), descent.ids)
-        return writer, qp
+            descent.quantizer = Quantizer(qp, writer.size)
+            if descent.iteration >= _SCHEDULE.prune_from * iterations:
+                descent.prune()
+
+        progress = count_iterations(descent, iterations)
+        times = [k / iterations for k in range(0, iterations, _SCHEDULE.update_interval)]
+        run(descent, progress, [End(), At(times, update)], lambda progress: RATE)
+        return writer.with_gaussians(descent.parameters(), descent.ids) if iterations else writer, qp
 
     def _round(self, writer: SceneWriter, qp: int, iterations: int, max_bytes: float = math.inf) -> bytes:
-        descent, quantizer = self._new_descent(writer), Quantizer(qp, writer.size)
-        descent.prune(quantizer)
+        descent = self._new_descent(writer)
+        descent.quantizer = quantizer = Quantizer(qp, writer.size)
+        descent.prune()
         return round_gradually(
-            descent, quantizer, lambda codes: writer.write(quantizer, codes, descent.ids), iterations, self.seed,
-            max_bytes,
-        )  # fmt: skip
+            descent, lambda codes: writer.write(quantizer, codes, descent.ids), iterations, self.seed, max_bytes
+        )
 
     def _new_descent(self, writer: SceneWriter) -> RateDistortionDescent:
-        return RateDistortionDescent(
-            writer.gaussians, writer.ids, self.image, writer.regions, self.objective, writer.size, self.min_sigma
-        )
+        return RateDistortionDescent(writer, self.objective, self.min_sigma)

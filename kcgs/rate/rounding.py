@@ -7,9 +7,10 @@ from collections.abc import Callable
 
 import torch
 
-from kcgs.codec.gaussians.quantize import Classes, Codes, Quantizer
+from kcgs.codec.gaussians.quantize import Classes, Codes
+from kcgs.optim.run import At, End, count_iterations, run
 
-from .descent import RateDistortionDescent
+from .descent import RATE, RateDistortionDescent
 
 # Numbers are tuned: vary one and compare the files of `python -m benchmarks rate`.
 
@@ -26,7 +27,6 @@ _SIZE_CHECKS = (0.3, 0.65, 0.9)
 
 def round_gradually(
     descent: RateDistortionDescent,
-    quantizer: Quantizer,
     write: Callable[[Codes], bytes],
     iterations: int,
     seed: int,
@@ -39,32 +39,50 @@ def round_gradually(
 
     Args:
         descent: of the Gaussians, which are removed from it where the file is too large.
-        quantizer: of the file.
         write: returns the file of the Gaussians of `descent`.
         iterations: steps of the descent; 0: round all at once.
         seed: of the order.
         max_bytes: largest size of the file, unless one Gaussian alone takes more.
     """
-    order = torch.rand(2, len(descent.ids), generator=torch.Generator().manual_seed(seed))
-    classes = quantizer.classify(descent.parameters())
-    checks = [*_SIZE_CHECKS, math.inf]
-    for iteration in range(iterations):
-        progress = iteration / iterations
-        if iteration % _GROUP_INTERVAL == 0:
-            codes = quantizer.quantize(descent.parameters(), classes)
-            if progress >= checks[0] and max_bytes < math.inf:
-                checks.pop(0)
-                rows = descent.remove_weakest(_excess(len(write(codes)), max_bytes, len(descent.ids)))
-                order, classes = order[:, rows], Classes(*(numbers[rows] for numbers in classes))
-                codes = quantizer.quantize(descent.parameters(), classes)
-            rounded_values = quantizer.dequantize(codes)
-            shape_mask = order[0] < progress / _SHAPE_SHARE
-            color_mask = order[1] < (progress - _SHAPE_SHARE) / (1 - _SHAPE_SHARE)
-        descent.step_around(rounded_values, shape_mask, color_mask, quantizer)
-    while len(data := write(quantizer.quantize(descent.parameters(), classes))) > max_bytes and len(descent.ids) > 1:
-        rows = descent.remove_weakest(_excess(len(data), max_bytes, len(descent.ids)))
-        classes = Classes(*(numbers[rows] for numbers in classes))
+    rounding = _Rounding(descent, write, seed, max_bytes)
+    groups = At([k / iterations for k in range(0, iterations, _GROUP_INTERVAL)], rounding.round_group)
+    run(descent, count_iterations(descent, iterations), [End(), groups], lambda progress: RATE)
+    while len(data := write(rounding.codes())) > max_bytes and len(descent.ids) > 1:
+        rounding.remove_excess(len(data))
     return data
+
+
+class _Rounding:
+    """The order in which Gaussians are rounded, and their classes."""
+
+    def __init__(
+        self, descent: RateDistortionDescent, write: Callable[[Codes], bytes], seed: int, max_bytes: float
+    ) -> None:
+        self.descent, self.write, self.max_bytes = descent, write, max_bytes
+        self.order = torch.rand(2, len(descent.ids), generator=torch.Generator().manual_seed(seed))
+        self.classes = descent.quantizer.classify(descent.parameters())
+        self.checks = [*_SIZE_CHECKS, math.inf]
+
+    def codes(self) -> Codes:
+        """Round all Gaussians as they are."""
+        return self.descent.quantizer.quantize(self.descent.parameters(), self.classes)
+
+    def round_group(self) -> None:
+        """Round the Gaussians whose turn it is; where the file is too large, remove some before."""
+        descent, progress = self.descent, self.descent.progress
+        codes = self.codes()
+        if progress >= self.checks[0] and self.max_bytes < math.inf:
+            self.checks.pop(0)
+            self.remove_excess(len(self.write(codes)))
+            codes = self.codes()
+        shape_mask = self.order[0] < progress / _SHAPE_SHARE
+        color_mask = self.order[1] < (progress - _SHAPE_SHARE) / (1 - _SHAPE_SHARE)
+        descent.round(descent.quantizer.dequantize(codes), shape_mask, color_mask)
+
+    def remove_excess(self, size: int) -> None:
+        """Remove the weakest Gaussians of a file of so many bytes, if those are too many."""
+        rows = self.descent.remove_weakest(_excess(size, self.max_bytes, len(self.descent.ids)))
+        self.order, self.classes = self.order[:, rows], Classes(*(numbers[rows] for numbers in self.classes))
 
 
 def _excess(size: int, max_bytes: float, num_gaussians: int) -> int:

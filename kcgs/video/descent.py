@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 
 import torch
 from torch import Tensor
 
+from kcgs.fitting import FitConfig
 from kcgs.fitting.contour_moves import move_contours
-from kcgs.fitting.objective import make_objective, propose_gaussians
-from kcgs.fitting.removal import lowest_impact
+from kcgs.fitting.pursuit import propose_for
+from kcgs.fitting.removal import least_impact
 from kcgs.functional import RegionMap
-from kcgs.optim.frame import widen
-from kcgs.optim.newton import Gaussians, NewtonDescent, area, error_weights, half_gradients
-
-from .splats import Splats, Target
+from kcgs.optim.descent import NewtonDescent
+from kcgs.optim.gaussians import Canvas, Gaussians, draft_cutoff
+from kcgs.optim.ms_ssim import MsSsim
+from kcgs.optim.newton import area
+from kcgs.optim.objectives import SquaredError
+from kcgs.optim.run import At, End, Event, count_iterations, run
+from kcgs.scene import Scene
 
 # Numbers are tuned: more iterations and relocations lower the error, and take longer and flicker more.
 
@@ -36,101 +41,107 @@ _FIXED_WEIGHT = 1e9
 _USUAL_OVERLAP = 12.0
 
 
-class FrameDescent:
+def canvas_of(scene: Scene, config: FitConfig) -> Canvas:
+    """Return what the frames of a fit are rendered with: the map of one, and the cutoff of a draft."""
+    return Canvas(scene.size, scene.regions, draft_cutoff(config.cutoff), config.backend)
+
+
+class FrameDescent(NewtonDescent):
     """Newton steps, relocations of rows and moves of contours towards an image.
 
-    Newton steps, unlike Adam's, leave what is still in a video where it is: Adam moves it six times as far. They are
-    those of :class:`kcgs.optim.newton.NewtonDescent`, which files take, too, for a price of bits and without contours.
+    Newton steps, unlike Adam's, leave what is still in a video where it is: Adam moves it six times as far.
 
     Args:
-        target: the image.
-        splats: the start.
+        image: (C, H, W).
+        scene: the start.
+        config: of the fit.
         movable_rows: Gaussians that may move, bool (N,).
         changed_pixels: where Gaussians may be relocated to, bool (H, W).
     """
 
-    def __init__(self, target: Target, splats: Splats, movable_rows: Tensor, changed_pixels: Tensor) -> None:
-        self.target, self.splats = target, splats
+    def __init__(
+        self, image: Tensor, scene: Scene, config: FitConfig, movable_rows: Tensor, changed_pixels: Tensor
+    ) -> None:
+        objective = MsSsim(image) if config.objective == "ms-ssim" else SquaredError(image)
+        super().__init__(Gaussians.of(scene.field), objective, canvas_of(scene, config), min_sigma=_MIN_SIGMA)
+        self.image, self.start, self.config = image, scene, config
         self.movable_rows, self.changed_pixels = movable_rows, changed_pixels
-        self.objective = make_objective(target.config.objective, target.image)
-        self.newton = NewtonDescent(Gaussians(*splats[:3]))
-        self.overlap = torch.ones_like(splats.means[:, 0])
+        self.overlap = torch.ones_like(self.gaussians.means[:, 0])
 
-    def run(self, relocations: Mapping[int, float], anchor: Tensor | None = None) -> Splats:
-        """Return the Gaussians after the descent, or the start if its error is lower.
+    @property
+    def scene(self) -> Scene:
+        """The Gaussians and the map at the moment."""
+        return Scene(self.gaussians.field(self.canvas.size), self.canvas.regions)
+
+    def run(self, relocations: Mapping[int, float], anchor: Tensor | None = None) -> Scene:
+        """Return the scene after the descent, or the start if its error is lower.
 
         Args:
             relocations: share of the movable rows that is relocated, by the iteration before which it is.
             anchor: labels that contours move from, as far as the config allows; None: they stay.
         """
-        start = self.splats
-        for iteration in range(_ITERATIONS):
-            if iteration in relocations:
-                self._relocate(round(relocations[iteration] * int(self.movable_rows.sum())))
-            if iteration == _CONTOUR_ITERATION and anchor is not None:
-                self._move_contours(anchor)
-            self._step(_RATE if iteration < _ITERATIONS - _FINAL_ITERATIONS else 0.5 * _RATE)
-        errors = [float(self.target.squared_error(splats).mean()) for splats in (self.splats, start)]
-        return self.splats if errors[0] <= errors[1] else start
+        before = self.squared_error()
+        events: list[Event] = [
+            End(),
+            *(At([k / _ITERATIONS], partial(self._relocate, s)) for k, s in relocations.items()),
+        ]
+        if anchor is not None:
+            events.append(At([_CONTOUR_ITERATION / _ITERATIONS], partial(self._move_contours, anchor)))
+        final = (_ITERATIONS - _FINAL_ITERATIONS) / _ITERATIONS
+        run(self, count_iterations(self, _ITERATIONS), events, lambda p: _RATE if p < final else 0.5 * _RATE)
+        return self.scene if self.squared_error() <= before else self.start
 
-    def _step(self, rate: float) -> None:
+    def squared_error(self) -> float:
+        """Return the mean squared error."""
+        return float(self.canvas.squared_error(self.gaussians, self.image).mean())
+
+    def step(self, rate: float) -> None:
         """Move the movable rows once."""
-        means, cholesky, colors, region_ids, regions = self.splats
-        gaussians = Gaussians(means, cholesky, colors)
-        gradients = half_gradients(self._render, gaussians, self.target.image, self.objective)
-        color_curvature = area(cholesky) * error_weights(gaussians, self.objective) * self.overlap
-        means, cholesky, colors = self.newton.step(
-            gaussians, gradients, color_curvature, rate, ~self.movable_rows[:, None]
-        )
-        self.splats = Splats(means, widen(cholesky, _MIN_SIGMA), colors, region_ids, regions)
+        self.frozen = ~self.movable_rows[:, None]
+        super().step(rate)
 
-    def _render(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> Tensor:
-        return self.target.render(self.splats._replace(means=means, cholesky=cholesky, colors=colors))
+    def color_curvature(self) -> Tensor:
+        """Return half the second derivative of the error by a colour, larger where Gaussians are crowded."""
+        return super().color_curvature() * self.overlap
 
-    def _relocate(self, count: int) -> None:
-        """Move so many rows, those of the lowest impact, to where they lower the error most.
+    def _relocate(self, share: float) -> None:
+        """Move so many of the rows, those of the lowest impact, to where they lower the error most.
 
         Rows that lower it nowhere get the colour 0.
         """
-        means, cholesky, colors, region_ids, regions = self.splats
-        image, backend = self.target.image, self.target.config.backend
+        gaussians, canvas = self.gaussians, self.canvas
+        count = round(share * int(self.movable_rows.sum()))
         visibility, self.overlap = self._overlap()
-        weights = error_weights(Gaussians(means, cholesky, colors), self.objective) * visibility
+        weights = self.objective.weigh(gaussians) * visibility
         weights = torch.where(self.movable_rows, weights, _FIXED_WEIGHT)
-
-        def products(cholesky: Tensor, colors: Tensor) -> Tensor:
-            return self.target.inner_products(self.splats._replace(cholesky=cholesky, colors=colors))
-
-        mask, new_colors = lowest_impact(products, cholesky, colors, count, weights)
-        colors = torch.where(self.movable_rows[:, None], new_colors, colors).masked_fill(mask[:, None], 0.0)
+        mask, new_colors = least_impact(canvas, gaussians, count, weights)
+        colors = torch.where(self.movable_rows[:, None], new_colors, gaussians.colors)
+        gaussians = gaussians._replace(colors=colors.masked_fill(mask[:, None], 0.0))
         self.newton.velocity[mask], self.movable_rows = 0.0, self.movable_rows | mask
 
-        residual = (image - self.target.render(self.splats._replace(colors=colors))) * self.changed_pixels
-        proposal = propose_gaussians(self.objective, residual, regions, int(mask.sum()), backend)
-        rows = mask.nonzero()[: len(proposal.means), 0]
-        if region_ids is not None and proposal.region_ids is not None:
-            region_ids = region_ids.index_copy(0, rows, proposal.region_ids)
-        means = means.index_copy(0, rows, proposal.means)
-        cholesky = cholesky.index_copy(0, rows, proposal.cholesky)
-        colors = colors.index_copy(0, rows, proposal.colors)
-        self.splats = Splats(means, cholesky, colors, region_ids, regions)
+        rendered = torch.where(self.changed_pixels, canvas.render(gaussians), self.image)
+        added = Gaussians.of(propose_for(self.objective, rendered, canvas, int(mask.sum())))
+        rows = mask.nonzero()[: len(added.means), 0]
+        self.gaussians = gaussians.map(lambda numbers, new: numbers.index_copy(0, rows, new), added)
+        if gaussians.region_ids is not None and added.region_ids is not None:
+            ids = gaussians.region_ids.index_copy(0, rows, added.region_ids)
+            self.gaussians = self.gaussians._replace(region_ids=ids)
 
     def _overlap(self) -> tuple[Tensor, Tensor]:
         """Return the share of each Gaussian that is visible, and the factor by which its place is crowded, (N,) each.
 
         Gaussians in one place move together: with the second derivative of one alone, their steps would be too long.
         """
-        total, sums = self.target.weight_sums(self.splats)
-        areas = area(self.splats.cholesky)
+        total, sums = self.canvas.weight_sums(self.gaussians)
+        areas = area(self.gaussians.cholesky)
         visibility = (sums(torch.ones_like(total)) / (2 * areas)).clamp_max(1.0)
         return visibility, (sums(total) / areas / _USUAL_OVERLAP).clamp_min(1.0)
 
     def _move_contours(self, anchor: Tensor) -> None:
         """Move contours to where the error is lower, or little higher."""
-        scene, image = self.splats.scene(self.target.size), self.target.image
 
         def squared_error(regions: RegionMap) -> Tensor:
-            return self.target.squared_error(self.splats._replace(regions=regions))
+            return self.canvas._replace(regions=regions).squared_error(self.gaussians, self.image)
 
-        regions = move_contours(scene, image, anchor, self.target.config, squared_error, _MAX_RISE)
-        self.splats = self.splats._replace(regions=regions)
+        regions = move_contours(self.scene, self.image, anchor, self.config, squared_error, _MAX_RISE)
+        self.canvas = self.canvas._replace(regions=regions)

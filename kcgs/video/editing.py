@@ -14,11 +14,12 @@ from kcgs.fitting import FitConfig
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 from kcgs.nn.field import join
+from kcgs.optim.gaussians import Gaussians
 from kcgs.scene import Scene, check_batch
 
 from .background import affine_motions, apply_affine, restore_background
 from .descent import FrameDescent
-from .splats import Splats, Target, stack
+from .stacking import stack
 
 
 @torch.inference_mode(False)
@@ -54,27 +55,28 @@ def delete_region(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
     deleted_pixels, deleted_rows = torch.isin(regions.labels, deleted_ids), torch.isin(row_ids, deleted_ids)
     # scenes don't keep the config of their fit; of it a descent uses the backend, the cutoff and the objective, whose
     # defaults suit every scene
-    config, frames = FitConfig(), list[Splats]()
+    config, frames = FitConfig(), list[Scene]()
     with threads_for_kernels(scenes.size[0] * scenes.size[1]):
         motions = affine_motions(scenes.field.means.detach(), ~deleted_rows)
         images, labels = restore_background(scenes.render(), regions.labels, deleted_pixels, motions)
         new_regions = regions.relabel(labels, "mean")
         for t, scene in enumerate(scenes):
-            means, cholesky, colors, _, _ = Splats.of(scene)
+            means, cholesky, colors = (table.clone() for table in Gaussians.of(scene.field)[:3])
             ids = torch.where(deleted_rows[t], new_regions.image(t).ids[0], row_ids[t])
             colors[deleted_rows[t]] = 0.0
             if t:  # rows that filled the frame before go on
-                rows, before = deleted_rows[t] & deleted_rows[t - 1], frames[-1]
+                rows, before = deleted_rows[t] & deleted_rows[t - 1], Gaussians.of(frames[-1].field)
                 means[rows] = apply_affine(motions[t] @ motions[t - 1].inverse(), before.means[rows])
                 cholesky[rows], colors[rows] = before.cholesky[rows], before.colors[rows]
                 if before.region_ids is not None:
                     ids[rows] = before.region_ids[rows]
-            start = Splats(means, cholesky, colors, ids, new_regions.image(t))
+            field = GaussianField(means, cholesky, colors, ids, size=scenes.size)
+            start = Scene(field, new_regions.image(t))
             movable_rows, changed_pixels = torch.ones_like(deleted_rows[t]), torch.ones_like(deleted_pixels[t])
             unused = deleted_rows[t] & (colors == 0).all(-1)
-            descent = FrameDescent(Target(images[t], config), start, movable_rows, changed_pixels)
+            descent = FrameDescent(images[t], start, config, movable_rows, changed_pixels)
             frames.append(descent.run({0: float(unused.float().mean())}))
-    return stack(frames, scenes.size, scenes.metadata)
+    return stack(frames, scenes.metadata)
 
 
 @torch.inference_mode(False)

@@ -20,12 +20,14 @@ from kcgs.errors import InvalidArgument
 from kcgs.fitting import FitConfig, fit
 from kcgs.fitting.problem import check_image_and_regions
 from kcgs.functional import RegionMap, lookup_regions
+from kcgs.nn import GaussianField
+from kcgs.optim.gaussians import Gaussians
 from kcgs.scene import Scene
 
-from .descent import FrameDescent
+from .descent import FrameDescent, canvas_of
 from .files import DEFAULT_FRAME_RATE
 from .flow import move_labels, move_points, optical_flow
-from .splats import Splats, Target, stack
+from .stacking import stack
 
 OnFrame = Callable[[int, Scene], bool | None]
 Labels = RegionMap | Tensor | NDArray[Any]
@@ -96,6 +98,8 @@ def fit_video(
         (3, 8, torch.Size([3, 3, 16, 24]))
     """
     config = FitConfig.from_recipe(recipe, **({"merge_regions": False} | settings))
+    if callable(config.objective):
+        raise InvalidArgument("objective", "a name: frames differ", "a function")
     video = _VideoFit(config, check_count("num_gaussians", num_gaussians), seed)
     length = len(frames) if isinstance(frames, Sized) else None
     with Progress("fit-video", pulse=length is None, visible=progress) as bar:
@@ -107,7 +111,7 @@ def fit_video(
     if not video.frames:
         raise InvalidArgument("frames", "at least one frame", "none", verb="hold")
     frame_rate = float(getattr(frames, "frame_rate", DEFAULT_FRAME_RATE))
-    return stack(video.frames, scene.size, {"frame_rate": f"{frame_rate:.10g}"})
+    return stack(video.frames, {"frame_rate": f"{frame_rate:.10g}"})
 
 
 class _VideoFit:
@@ -115,7 +119,7 @@ class _VideoFit:
 
     def __init__(self, config: FitConfig, num_gaussians: int, seed: int) -> None:
         self.config, self.num_gaussians, self.seed = config, num_gaussians, seed
-        self.frames: list[Splats] = []
+        self.frames: list[Scene] = []
         self.image = torch.zeros(())  # the last frame, (C, H, W); a placeholder before the first
         self.error = torch.zeros(())  # of each pixel when it was last fitted, (H, W)
 
@@ -123,85 +127,93 @@ class _VideoFit:
         """Fit a frame; without labels the map of the frame before moves along, where there is one."""
         previous = self.image
         self.image, regions = check_image_and_regions(frame, labels)
-        target, changed_pixels = Target(self.image, self.config), torch.ones_like(self.image[0], dtype=torch.bool)
+        changed_pixels = torch.ones_like(self.image[0], dtype=torch.bool)
         if not self.frames:
-            splats = self._fit_anew(regions)
+            scene = self._fit_anew(regions)
         elif previous.shape != self.image.shape:
             name = f"frame {len(self.frames)}"
             raise InvalidArgument(name, f"shape {tuple(previous.shape)}", tuple(self.image.shape), verb="have")
         else:
             with threads_for_kernels(previous[0].numel()):
-                splats, changed_pixels = self._follow(target, optical_flow(previous, self.image), regions)
-        self.frames.append(splats)
-        self.error = torch.where(changed_pixels, target.squared_error(splats), self.error)
-        return splats.scene(target.size)
+                scene, changed_pixels = self._follow(optical_flow(previous, self.image), regions)
+        self.frames.append(scene)
+        self.error = torch.where(changed_pixels, self._squared_error(scene), self.error)
+        return scene
 
-    def _fit_anew(self, regions: RegionMap | None) -> Splats:
+    def _squared_error(self, scene: Scene) -> Tensor:
+        """Return the squared error of each pixel, (H, W)."""
+        return canvas_of(scene, self.config).squared_error(Gaussians.of(scene.field), self.image)
+
+    def _fit_anew(self, regions: RegionMap | None) -> Scene:
         """Fit a frame by itself; rows that it leaves unused have colour 0."""
         config = self.config
         if self.frames:  # contours have the softness of the first frame
             config = config.model_copy(update={"softness": 0.0})
         scene = fit(self.image, regions, self.num_gaussians, recipe=config, seed=self.seed).scene
-        means, cholesky, colors, fitted_ids, _ = Splats.of(scene)
+        means, cholesky, colors, region_ids = Gaussians.of(scene.field)
         unused = (0, 0, 0, self.num_gaussians - scene.num_gaussians)
         means, cholesky, colors = pad(means, unused, value=1.0), pad(cholesky, unused, value=1.0), pad(colors, unused)
         regions = scene.regions or regions  # a fit removes a map of one region
-        if regions is None:
-            return Splats(means, cholesky, colors, None, None)
-        region_ids = regions.ids[:1].expand(self.num_gaussians).clone()
-        if fitted_ids is not None:
-            region_ids[: len(fitted_ids)] = fitted_ids
-        return Splats(means, cholesky, colors, region_ids, regions)
+        if regions is not None:
+            fitted_ids, region_ids = region_ids, regions.ids[:1].expand(self.num_gaussians).clone()
+            if fitted_ids is not None:
+                region_ids[: len(fitted_ids)] = fitted_ids
+        return Scene(GaussianField(means, cholesky, colors, region_ids, size=scene.size), regions)
 
-    def _follow(self, target: Target, flow: Tensor, regions: RegionMap | None) -> tuple[Splats, Tensor]:
+    def _follow(self, flow: Tensor, regions: RegionMap | None) -> tuple[Scene, Tensor]:
         """Return a frame, fitted from the one before, and the mask of the pixels that changed."""
         first, before = self.frames[0].regions, self.frames[-1].regions
         is_moved = regions is None
         if first is not None and before is not None:
             labels = move_labels(flow, before.labels) if regions is None else regions.labels
             regions = first.relabel(labels, "mean")
-        start, movable_rows, changed_pixels = self._start(target, flow, regions)
-        if float(target.squared_error(start).mean()) > _CUT_SHARE * float(target.image.var((1, 2)).mean()):
+        start, movable_rows, changed_pixels = self._start(flow, regions)
+        if float(self._squared_error(start).mean()) > _CUT_SHARE * float(self.image.var((1, 2)).mean()):
             if is_moved and regions is not None:
                 regions = regions.relabel(regions.labels.flatten().mode()[0].expand(regions.size))
             return self._fit_anew(regions), torch.ones_like(changed_pixels)
         if changed_pixels.any():
             anchor = regions.labels if regions is not None and self.config.move_contours else None
-            start = FrameDescent(target, start, movable_rows, changed_pixels).run(_RELOCATIONS, anchor)
+            descent = FrameDescent(self.image, start, self.config, movable_rows, changed_pixels)
+            start = descent.run(_RELOCATIONS, anchor)
         return start, changed_pixels
 
-    def _start(self, target: Target, flow: Tensor, regions: RegionMap | None) -> tuple[Splats, Tensor, Tensor]:
+    def _start(self, flow: Tensor, regions: RegionMap | None) -> tuple[Scene, Tensor, Tensor]:
         """Return the Gaussians before, moved, the mask of those that may move, and that of the pixels that changed.
 
         A pixel changed if the Gaussians, not moved, explain its surroundings less well than when they were fitted.
         """
-        means, cholesky, colors, region_ids, _ = self.frames[-1]
+        means, cholesky, colors, region_ids = Gaussians.of(self.frames[-1].field)
         if regions is not None and region_ids is not None:  # rows of a region that is gone have no use
             is_present = torch.isin(region_ids, regions.ids)
             region_ids = torch.where(is_present, region_ids, regions.ids[0])
             colors = torch.where(is_present[:, None], colors, 0.0)
-        still = Splats(means, cholesky, colors, region_ids, regions)
-        changed_pixels = _local_mean(target.squared_error(still)) > _MAX_GROWTH * _local_mean(self.error) + _LEVEL
-        _, sums = target.weight_sums(still)
+        still = Gaussians(means, cholesky, colors, region_ids)
+        canvas = canvas_of(self.frames[-1], self.config)._replace(regions=regions)
+        error = canvas.squared_error(still, self.image)
+        changed_pixels = _local_mean(error) > _MAX_GROWTH * _local_mean(self.error) + _LEVEL
+        _, sums = canvas.weight_sums(still)
         movable_rows = sums(changed_pixels[None].to(flow)) >= _MOVABLE_SHARE * sums(torch.ones_like(flow[:1]))
-        means = torch.where(movable_rows[:, None], _move_means(flow, still), means)
-        return still._replace(means=means), movable_rows, changed_pixels
+        means = torch.where(movable_rows[:, None], _move_means(flow, still, regions), means)
+        moved = still._replace(means=means).field(canvas.size)
+        return Scene(moved, regions), movable_rows, changed_pixels
 
 
 def _local_mean(error: Tensor) -> Tensor:
     return avg_pool2d(error[None], _WINDOW, 1, _WINDOW // 2, count_include_pad=False)[0]
 
 
-def _move_means(flow: Tensor, splats: Splats) -> Tensor:
+def _move_means(flow: Tensor, gaussians: Gaussians, regions: RegionMap | None) -> Tensor:
     """Move centres along the flow; a centre that would leave its region moves as the region does on average."""
-    new_means, regions = move_points(flow, splats.means), splats.regions
-    if regions is None or splats.region_ids is None:
+    means, region_ids = gaussians.means, gaussians.region_ids
+    new_means = move_points(flow, means)
+    if regions is None or region_ids is None:
         return new_means
     pixels = regions.index_of(regions.labels).flatten()
     sums = torch.stack([pixels.bincount(offsets.flatten()) for offsets in flow], -1)
     mean = sums / pixels.bincount()[:, None]
-    inside = lookup_regions(new_means, regions.labels) == splats.region_ids
-    return torch.where(inside[:, None], new_means, splats.means - mean[splats.region_index].to(new_means))
+    inside = lookup_regions(new_means, regions.labels) == region_ids
+    return torch.where(inside[:, None], new_means, means - mean[regions.index_of(region_ids)].to(new_means))
 
 
 def _pair(frames: Iterable[Any], label_maps: Labels | Iterable[Labels] | None) -> Iterator[tuple[Any, Labels | None]]:

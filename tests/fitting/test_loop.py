@@ -12,8 +12,8 @@ from torch import Tensor
 from kcgs import FitConfig, GaussianField, RegionMap, fit
 from kcgs.data import chart_2x3, chart_pie
 from kcgs.fitting import available_recipes
-from kcgs.fitting.optimizers import ImageGSAdam
 from kcgs.fitting.problem import make_problem
+from kcgs.fitting.published.image_gs import ImageGSAdam
 from kcgs.functional import ef_psnr, psnr
 from tests.conftest import Clock
 

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from kcgs import RegionMap, fit
-from kcgs.fitting.removal import lowest_impact
+from kcgs.fitting.removal import least_impact
 from kcgs.functional import psnr, region_splat
-from kcgs.functional.weights import inner_products
+from kcgs.optim.gaussians import Canvas, Gaussians
 
 SIZE = (40, 60)
 
@@ -27,14 +27,11 @@ class RemovalCase:
     def render(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> Tensor:
         return region_splat(means, cholesky, colors, self.ids, self.regions, size=SIZE, cutoff=1e-3)
 
-    def products(self, cholesky: Tensor, colors: Tensor) -> Tensor:
-        arguments = self.means, cholesky, colors, self.ids, self.regions
-        return inner_products(*arguments, size=SIZE, cutoff=1e-3, backend="auto")
-
     def remove(self, count: int, weight: Tensor | None = None) -> tuple[list[int], Tensor, float, float]:
         """Return who is removed, the colours of all, and the squared error without and with these colours."""
         weight = torch.ones(len(self.means)) if weight is None else weight
-        removed, colors = lowest_impact(self.products, self.cholesky, self.colors, count, weight)
+        gaussians = Gaussians(self.means, self.cholesky, self.colors, self.ids)
+        removed, colors = least_impact(Canvas(SIZE, self.regions, 1e-3), gaussians, count, weight)
         image = self.render(self.means, self.cholesky, self.colors)
         errors = [
             float((self.render(self.means, self.cholesky, c * ~removed[:, None]) - image).square().sum())

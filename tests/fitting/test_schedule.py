@@ -11,12 +11,13 @@ import torch
 
 from kcgs import FitConfig, RegionMap
 from kcgs.fitting.contour_moves import accept_moves
-from kcgs.fitting.optimizers import make_optimizer, set_learning_rates
+from kcgs.fitting.events import Densify, SettleContours
+from kcgs.fitting.methods import method_of
 from kcgs.fitting.problem import make_problem
 from kcgs.fitting.result import HistoryEntry
+from kcgs.fitting.schedule import make_schedule
 from kcgs.fitting.start import start
 from kcgs.fitting.state import FitState
-from kcgs.fitting.strategies import Densify, SettleContours, make_strategies
 from kcgs.nn import GaussianField
 
 
@@ -51,20 +52,33 @@ class TestDensify:
 
     def test_is_due_where_the_schedule_asks_for_more(self) -> None:
         state, densify = state_of(60), Densify()
+        assert densify.due(state) == 0.05
         state.progress = 0.05
-        assert not densify.due(state)  # nothing is logged yet
+        densify.act(state)
+        assert state.num_gaussians == 1  # nothing is logged yet
         state.history.append(HistoryEntry(0, 0.0, 1.0, 10.0, 10.0, 5))
-        assert densify.due(state)
-        state.progress = 0.04
-        assert not densify.due(state)
+        densify.act(state)
+        assert state.num_gaussians > 1 and densify.due(state) == pytest.approx(0.1)
+
+    @pytest.mark.parametrize("iterations", [100, 700, 1999])
+    def test_is_due_no_later_than_the_number_changes(self, iterations: int) -> None:
+        state, densify = state_of(60, iterations=iterations), Densify()
+        due, num_asked = densify.due(state), 0
+        for state.iteration in range(iterations):
+            state.progress = state.iteration / iterations
+            assert state.progress >= due or densify.target(state) == state.num_requested
+            if state.progress >= due:
+                state.num_requested, num_asked = densify.target(state), num_asked + 1
+                due = densify.due(state)
+        assert num_asked < 30 + iterations / 10
 
 
 class TestLearningRates:
     def rates(self, progress: float, factor: float = 1.0, iterations: int = 12_500, **settings: Any) -> list[float]:
         config = FitConfig(learning_rate_factor=factor, iterations=iterations, **settings)
-        optimizer = make_optimizer(config, GaussianField.random(3, (8, 8), seed=0), 2.0)
-        set_learning_rates(optimizer, config, progress)
-        return [float(group["lr"]) for group in optimizer.param_groups]
+        method = method_of(config)
+        optimizer = method.make_optimizer(config, GaussianField.random(3, (8, 8), seed=0), 2.0)
+        return [float(group["lr"]) * method.rate(progress) for group in optimizer.param_groups]
 
     def test_ours_fall_to_a_tenth(self) -> None:
         geometry, colors = zip(*(self.rates(p / 10) for p in range(11)), strict=True)
@@ -86,7 +100,7 @@ class TestLearningRates:
         assert thrice == pytest.approx([3 * rate for rate in once])
 
 
-class TestStrategies:
+class TestEvents:
     @pytest.mark.parametrize(
         ("settings", "names"),
         [
@@ -96,13 +110,12 @@ class TestStrategies:
         ],
     )
     def test_are_those_of_the_settings(self, settings: dict[str, Any], names: list[str]) -> None:
-        assert [type(strategy).__name__ for strategy in make_strategies(FitConfig(**settings))] == names
+        assert [type(event).__name__ for event in make_schedule(FitConfig(**settings))] == names
 
     def test_late_moves_are_even(self) -> None:
-        state, strategy, times = state_of(10), SettleContours(after=0.5), []
+        state, event, times = state_of(10), SettleContours(after=0.5), []
         for p in range(101):
-            state.progress = p / 100
-            if strategy.due(state):
+            if p / 100 >= event.due(state):
                 state.num_late_moves += 1
                 times.append(p / 100)
         assert times == [0.6, 0.7, 0.8, 0.9]

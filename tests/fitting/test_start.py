@@ -10,7 +10,8 @@ from torch import Tensor
 
 from kcgs import RegionMap
 from kcgs.fitting import initial_field
-from kcgs.fitting.initial import gradient_field, random_field
+from kcgs.fitting.initial import random_field
+from kcgs.fitting.published.gradient_start import gradient_field
 from kcgs.functional import lookup_regions, region_splat
 from kcgs.nn import GaussianField
 

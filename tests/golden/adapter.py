@@ -16,9 +16,8 @@ import kcgs
 from kcgs import GaussianField, RegionMap, Scene, editing, segment
 from kcgs import functional as F
 from kcgs.codec import decode, encode
-from kcgs.fitting import fit
+from kcgs.fitting import fit, propose_gaussians
 from kcgs.fitting.contour_moves import refine_contours
-from kcgs.fitting.pursuit import propose
 from kcgs.functional.contour_fit import contour_gain
 from kcgs.onnx import generic_decoder, scene_decoder
 from kcgs.pruning import prune
@@ -221,7 +220,7 @@ def run_prune(p: Parts, tolerance: float) -> dict[str, Any]:
 
 def run_propose(p: Parts, residual: Tensor, count: int) -> tuple[Any, ...]:
     """Find Gaussians to add."""
-    field = propose(residual, _regions(p), count)
+    field = propose_gaussians(residual, count, _regions(p))
     return field.means.detach(), field.cholesky.detach(), field.colors.detach(), field.region_ids
 
 

@@ -1,4 +1,4 @@
-"""The objective `ms-ssim` of a fit."""
+"""The objective `ms-ssim`."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from kcgs.functional import RegionMap
 from kcgs.functional.metrics import K1, K2, SCALE_WEIGHTS, SSIM_SIGMA, SSIM_WINDOW, window_mean
-from kcgs.nn import GaussianField
 
-from .pursuit import halve, propose
+from .gaussians import Gaussians
+from .objectives import Objective, Residual
 
 if TYPE_CHECKING:
     from .similarity import Passes
@@ -25,7 +24,7 @@ _SQUARED_REDUCED = 0.03
 _MIN_SCORE = 0.2
 
 
-class MsSsimObjective:
+class MsSsim(Objective):
     r"""What MS-SSIM lacks, as its logarithm, and a little of the squared error.
 
     .. math:: E(r) = -\sum_k w_k \log \overline{s_k} / Z + 0.003 |r|^2, \quad
@@ -36,7 +35,7 @@ class MsSsimObjective:
     has a weight of 4 % and would take three quarters of the time. Of the windows, which overlap, those at even rows and
     columns count. Those that the border cuts count as much as others, else the outer tenth of an image would count
     little. Near the image E is quadratic, and `importance` and `weigh`
-    are that form's. Farther off it is not: where texture is missing, more variance in the render is better, so `apply`
+    are that form's. Farther off it is not: where texture is missing, more variance in the render is better, so `slope`
     is half the gradient of E itself.
 
     Args:
@@ -46,12 +45,15 @@ class MsSsimObjective:
 
     Example:
         >>> image = torch.rand(3, 48, 64, generator=torch.Generator().manual_seed(0))
-        >>> objective = MsSsimObjective(image)
-        >>> objective.value(0.1 - 0.2 * image) < objective.value(0.5 - image)
+        >>> objective = MsSsim(image)
+        >>> bool(objective.value(0.1 + 0.8 * image) < objective.value(torch.full_like(image, 0.5)))
         True
     """
 
+    is_ranked_by_psnr = False
+
     def __init__(self, image: Tensor, reduction: int = 1) -> None:
+        super().__init__(image)
         self._squared = _SQUARED if reduction == 1 else _SQUARED_REDUCED
         self._scales: list[tuple[Tensor, Tensor, Tensor, Tensor, float]] = []
         masks, plane = [], image
@@ -84,34 +86,39 @@ class MsSsimObjective:
             scales = [[plane.numpy() for plane in planes] for *planes, _ in self._scales]
             self._passes = Passes(scales, factors, _MIN_SCORE)  # the compiled form of `_measure`
 
-    def apply(self, difference: Tensor) -> Tensor:
-        """Return half the gradient of E, (C, H, W), at a difference r, render - image, which it may overwrite.
+    def slope(self, render: Tensor) -> Tensor:
+        """Return half the gradient of E.
 
         Where the mean of a scale is below 0.2, E takes it as 0.2, and the slope of its logarithm is 1 / 0.2.
         """
+        return self._slope(render.sub_(self.image))
+
+    def _slope(self, difference: Tensor) -> Tensor:
         if self._passes is None:
             return self._measure(difference)[1]
         gradient = difference.contiguous()
         self._passes.differentiate(gradient.numpy(), self._squared)
         return gradient
 
-    def value(self, difference: Tensor) -> float:
-        """Return E, as a mean over pixels and channels."""
-        return float(self.value_on_device(difference))
-
-    def value_on_device(self, difference: Tensor) -> Tensor:
-        """Return E as a tensor, float64, on the device of the difference."""
+    def value(self, render: Tensor) -> Tensor:
+        """Return E of a render that is clipped to [0, 1], as a mean over pixels and channels, in float64."""
+        difference = render.clamp(0.0, 1.0) - self.image
         if self._passes is None:
             total = self._measure(difference)[0].double()
         else:
             total = torch.tensor(self._passes.value(difference.contiguous().numpy()), dtype=torch.float64)
         return total / difference[0].numel() + self._squared * difference.square().mean().double()
 
-    def weigh(self, means: Tensor, cholesky: Tensor) -> Tensor:
+    def residual(self, render: Tensor) -> Residual:
+        """Return each pixel's gradient by the root of what it counts: the square is what a Gaussian may gain."""
+        root = self.importance.sqrt()
+        return Residual(-self._slope(render - self.image) / root, root)
+
+    def weigh(self, gaussians: Gaussians) -> Tensor:
         """Return about what the squared error of Gaussians counts in E, by their places and sizes, (N,)."""
-        l11, l21, l22 = cholesky.detach().unbind(-1)
+        l11, l21, l22 = gaussians.cholesky.detach().unbind(-1)
         xx, xy, yy = l11**2, l11 * l21, l21**2 + l22**2
-        x, y = means.detach().floor().long().unbind(-1)
+        x, y = gaussians.means.detach().floor().long().unbind(-1)
         total = torch.zeros_like(xx)
 
         def energy_after(variance: float) -> Tensor:
@@ -163,30 +170,12 @@ class MsSsimObjective:
         return planes[0]
 
 
-def make_objective(name: str, image: Tensor, reduction: int = 1) -> MsSsimObjective | None:
-    """Return the objective of a name, None where it is the squared error."""
-    return MsSsimObjective(image, reduction) if name == "ms-ssim" else None
-
-
-def propose_gaussians(
-    objective: MsSsimObjective | None,
-    residual: Tensor,
-    regions: RegionMap | None,
-    count: int,
-    backend: str,
-) -> GaussianField:
-    """Find at most `count` Gaussians that lower the objective most, of a residual, image - render: see `propose`."""
-    if objective is None:
-        return propose(residual, regions, count, backend=backend)
-    # a pixel's gradient by the root of what it counts: the square is what a Gaussian may gain
-    root = objective.importance.sqrt()
-    added = propose(-objective.apply(-residual) / root, regions, count, backend=backend)
-    # in the filtered residual, what counts more is larger
-    x, y = added.means.detach().long().unbind(-1)
-    added.colors.data = added.colors.detach() / root[y, x, None]
-    return added
-
-
 def _blur(maps: Tensor) -> Tensor:
     """Filter by the window of SSIM, with zeros beyond the border; it is its own transpose."""
     return window_mean(pad(maps, [SSIM_WINDOW // 2] * 4))
+
+
+def halve(planes: Tensor) -> Tensor:
+    """Average blocks of 2 x 2, (..., h, w), without an odd last row; five times faster on one core than torch's."""
+    rows = planes[..., : planes.shape[-2] // 2 * 2 : 2, :] + planes[..., 1::2, :]
+    return (rows[..., : rows.shape[-1] // 2 * 2 : 2] + rows[..., 1::2]).mul_(0.25)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from functools import partial
 
 import torch
+from torch import Tensor
 
 from kcgs.fitting.contour_moves import move_contours
-from kcgs.fitting.descent import squared_error
 from kcgs.fitting.state import FitState
 from kcgs.functional import RegionMap, choose_softness
 
@@ -27,25 +27,30 @@ class AdaptContours:
     additions_per_softness: int = 4
     """Before every fourth addition their softness is chosen anew, where the settings ask for it."""
 
-    def apply(self, state: FitState) -> None:
+    def adapt(self, state: FitState) -> None:
         """Move the contours, and at times choose their softness, if that is due before this addition."""
         if state.num_additions % self.additions_per_move:
             return
         _move_contours(state, self.max_rise)
-        regions, problem = state.scene.regions, state.problem
+        regions, problem = state.regions, state.problem
         is_turn = state.num_additions % self.additions_per_softness == self.additions_per_move
         if regions is not None and problem.chooses_softness and is_turn:
             labels = regions.labels.cpu()
             chosen = RegionMap.from_labels(labels, choose_softness(problem.image, labels))
-            state.scene.regions = chosen.to(problem.image.device)
+            state.regions = chosen.to(problem.image.device)
 
 
 def _move_contours(state: FitState, max_rise: float) -> None:
     """Move the contours where that raises the squared error about them by no more than a factor."""
-    problem, scene = state.problem, state.scene
-    if scene.regions is not None and state.anchor is not None:
-        error, anchor = partial(squared_error, state), state.anchor.labels
-        scene.regions = move_contours(scene, problem.image, anchor, problem.config, error, max_rise)
+    problem, gaussians, canvas = state.problem, state.gaussians, state.canvas
+    if state.regions is None or state.anchor is None or not problem.has_image:
+        return
+
+    def squared_error(regions: RegionMap) -> Tensor:
+        return canvas._replace(regions=regions).squared_error(gaussians, problem.image)
+
+    anchor = state.anchor.labels
+    state.regions = move_contours(state.scene, problem.image, anchor, problem.config, squared_error, max_rise)
 
 
 @dataclass(frozen=True)
@@ -57,14 +62,14 @@ class SettleContours:
     num_moves: int = 4
     """How often contours move, evenly over the rest of the fit."""
 
-    def due(self, state: FitState) -> bool:
-        """True at the time of the next move."""
+    def due(self, state: FitState) -> float:
+        """Return the time of the next move."""
         move = state.num_late_moves + 1
-        share = self.after + (1 - self.after) * move / (self.num_moves + 1)
-        return move <= self.num_moves and state.progress >= share
+        return self.after + (1 - self.after) * move / (self.num_moves + 1) if move <= self.num_moves else math.inf
 
     @torch.no_grad()
-    def apply(self, state: FitState) -> None:
+    def act(self, state: FitState) -> None:
         """Move the contours."""
+        state.waits = True
         state.num_late_moves += 1
         _move_contours(state, max_rise=1.0)

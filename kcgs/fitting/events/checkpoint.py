@@ -13,23 +13,23 @@ from typing import Any
 import torch
 
 from kcgs._atomic import check_writable, write_file
+from kcgs.fitting.problem import Problem
+from kcgs.fitting.result import HistoryEntry
+from kcgs.fitting.start import make_state
+from kcgs.fitting.state import FitState
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
-from .initial import initial_sigma
 from .log import take_up
-from .optimizers import make_optimizer
-from .problem import Problem
-from .result import HistoryEntry
-from .state import FitState
 
 # a checkpoint is written when the fit has run this many times as long as the last one took to write
 _RUN_PER_WRITE = 100.0
-_VERSION = 7
+_VERSION = 8
 _DIGEST_SIZE = 32  # bytes of the SHA-256 of the content, which begins the file
-# all fields of the state that are numbers or flags
-_NUMBERS = [field.name for field in fields(FitState) if field.type in ("bool", "int", "float")]
+# all fields of the state that are numbers
+_NUMBERS = [field.name for field in fields(FitState) if field.type in ("int", "float")]
+_NUMBERS.remove("progress")  # the clock may give it anew
 
 
 class Checkpoint:
@@ -40,13 +40,14 @@ class Checkpoint:
         self.path, self.problem = Path(path), problem
         self._next_write = 0.0
 
-    def due(self) -> bool:
-        """True when it is time to write, so that writing costs about a hundredth of the fit."""
-        return time.perf_counter() >= self._next_write
-
     def write(self, state: FitState, seconds: float) -> None:
-        """Put the state, and the seconds of the fit so far, in the file's place."""
+        """Put the state, and the seconds of the fit so far, in the file's place, unless it was written just now.
+
+        Writing costs about a hundredth of the fit.
+        """
         start = time.perf_counter()
+        if start < self._next_write and state.iteration < self.problem.config.max_iterations:
+            return
         take_up(state, wait=True)
         buffer = io.BytesIO()
         torch.save({"problem": _fingerprint(self.problem), "seconds": seconds, **_to_plain(state)}, buffer)
@@ -86,6 +87,7 @@ def _to_plain(state: FitState) -> dict[str, Any]:
     """Return tensors, numbers, strings, lists and dicts, which load without running code."""
     return {
         **{name: getattr(state, name) for name in _NUMBERS},
+        "cutoff": state.canvas.cutoff,
         "scene": _scene_to_plain(state.scene),
         "best": None if state.best is None else _scene_to_plain(state.best),
         "anchor": None if state.anchor is None else state.anchor.state(),
@@ -96,17 +98,16 @@ def _to_plain(state: FitState) -> dict[str, Any]:
 
 def _from_plain(plain: dict[str, Any], problem: Problem) -> FitState:
     scene = _scene_from_plain(plain["scene"], problem.size)
-    optimizer = make_optimizer(problem.config, scene.field, initial_sigma(problem.size, plain["num_initial"]))
-    optimizer.load_state_dict(plain["optimizer"])
-    return FitState(
-        problem,
-        scene,
-        optimizer,
-        None if plain["anchor"] is None else RegionMap.from_state(plain["anchor"]),
+    state = make_state(
+        problem, scene.field, scene.regions,
+        anchor=None if plain["anchor"] is None else RegionMap.from_state(plain["anchor"]),
         history=[HistoryEntry(*entry) for entry in plain["history"]],
         best=None if plain["best"] is None else _scene_from_plain(plain["best"], problem.size),
         **{name: plain[name] for name in _NUMBERS},
-    )
+    )  # fmt: skip
+    state.canvas = state.canvas._replace(cutoff=plain["cutoff"])
+    state.optimizer.load_state_dict(plain["optimizer"])
+    return state
 
 
 def _scene_to_plain(scene: Scene) -> dict[str, Any]:

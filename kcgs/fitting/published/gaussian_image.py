@@ -10,7 +10,7 @@ from torch import Tensor
 from kcgs.nn import GaussianField
 
 from .adan import Adan
-from .published import MIN_SIGMA, PublishedOptimizer
+from .optimizer import MIN_SIGMA, PublishedOptimizer
 
 # tanh reaches it
 _EDGE = 1.0 - 1e-6
@@ -29,6 +29,8 @@ class GaussianImageAdan(PublishedOptimizer):
     learning_rate = 1e-3
     full_iterations = 50_000
     max_rate_factor = 20.0
+    half_life = 0.4
+    """Share of a fit after which the rates halve."""
     max_sigma = 10.0
     """The widest that a Gaussian may be, in image diagonals."""
 
@@ -36,6 +38,11 @@ class GaussianImageAdan(PublishedOptimizer):
         speedup = min(self.max_rate_factor, math.sqrt(max(1.0, self.full_iterations / iterations)))
         rate = self.learning_rate * speedup * rate_factor
         super().__init__(field, [rate, rate * sigma, rate], Adan, self.max_sigma)
+
+    @classmethod
+    def rate(cls, progress: float) -> float:
+        """Return the factor of the learning rates."""
+        return 0.5 ** int(progress / cls.half_life)
 
     def encode(self, field: GaussianField) -> list[Tensor]:
         """Return the centres before tanh, factors and colours."""

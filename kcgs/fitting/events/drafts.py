@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from kcgs.fitting.log import take_up
 from kcgs.fitting.state import FitState
+
+from .log import take_up
 
 
 @dataclass(frozen=True)
@@ -16,12 +17,14 @@ class EndDrafts:
     after: float = 0.85
     """Share of the fit that renders with the draft cutoff."""
 
-    def due(self, state: FitState) -> bool:
-        """True once, when drafts are over."""
-        return state.progress >= self.after and state.cutoff != state.problem.config.cutoff
+    def due(self, state: FitState) -> float:
+        """Return the end of drafts, as long as there are drafts."""
+        return self.after if state.is_draft else math.inf
 
-    def apply(self, state: FitState) -> None:
+    def act(self, state: FitState) -> None:
         """Set the cutoff; the next state that is measured is the best, since drafts do not compare with it."""
-        if state.cutoff != state.problem.config.cutoff:
+        if state.is_draft:
+            state.waits = True
             take_up(state, wait=True)
-            state.cutoff, state.best_score = state.problem.config.cutoff, -math.inf
+            state.canvas = state.canvas._replace(cutoff=state.problem.config.cutoff)
+            state.best_value = math.inf

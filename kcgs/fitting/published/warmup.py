@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -19,16 +20,23 @@ class Warmup:
     until: float = 0.5
     """Share of the iterations after which the ids are frozen."""
 
-    def due(self, state: FitState) -> bool:
-        """True at the iterations of a refresh."""
-        iteration, iterations = state.iteration, state.problem.config.usual_iterations
-        if state.scene.regions is None or iteration % max(1, round(self.every * iterations)):
-            return False
-        return 0 < iteration <= self.until * iterations
+    def due(self, state: FitState) -> float:
+        """Return the progress at the next refresh, if no clock runs ahead of the iterations."""
+        iterations = state.problem.config.usual_iterations
+        number = -(-state.iteration // self._interval(state))
+        is_over = state.regions is None or state.iteration > self.until * iterations
+        return math.inf if is_over else number * self._interval(state) / state.problem.config.max_iterations
 
-    def apply(self, state: FitState) -> None:
+    def _interval(self, state: FitState) -> int:
+        return max(1, round(self.every * state.problem.config.usual_iterations))
+
+    def act(self, state: FitState) -> None:
         """Read the ids, but leave no region without its last Gaussian: nothing else would feel the error there."""
-        field, regions = state.scene.field, state.scene.regions
+        iterations = state.problem.config.usual_iterations
+        if state.iteration % self._interval(state) or not 0 < state.iteration <= self.until * iterations:
+            return
+        state.waits = True
+        field, regions = state.field, state.regions
         assert regions is not None and field.region_ids is not None
         ids = lookup_regions(field.means, regions.labels)
         occupied = torch.zeros(regions.num_regions, dtype=torch.bool, device=ids.device)

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 
-from kcgs.fitting.descent import render, squared_error
-from kcgs.fitting.initial import initial_sigma
-from kcgs.fitting.objective import propose_gaussians
+from kcgs.fitting.pursuit import propose_for
 from kcgs.fitting.removal import remove_gaussians
-from kcgs.fitting.sampling import sample_pixels
 from kcgs.fitting.state import FitState
-from kcgs.functional import lookup_regions
 from kcgs.nn import GaussianField
 
 from .contours import AdaptContours
+
+# of progress, beyond rounding errors
+_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -57,57 +56,50 @@ class Densify:
             return first + round((most - first) * (1 + int(share * (self.steps - 1))) / self.steps)
         if progress >= self.settled:
             return final
-        cycles = max(1, round((self.settled - self.end) * state.expected_iterations / self.cycle))
-        phase = (progress - self.end) / (self.settled - self.end) * cycles % 1.0
+        phase = (progress - self.end) / (self.settled - self.end) * self._num_cycles(state) % 1.0
         return most - round((most - final) * int(phase * (self.removals + 1)) / self.removals)
 
-    def due(self, state: FitState) -> bool:
-        """True when the schedule asks for another number of Gaussians, and one state was measured."""
-        return bool(state.history) and self.target(state) != state.num_requested
+    def due(self, state: FitState) -> float:
+        """Return about when the schedule asks for another number of Gaussians: not after it does."""
+        return state.progress if self.target(state) != state.num_requested else self._next_change(state)
+
+    def _next_change(self, state: FitState) -> float:
+        progress = state.progress
+        if progress < self.begin:
+            return self.begin
+        if progress < self.end:
+            count, first, last = max(1, self.steps - 1), self.begin, self.end
+        elif progress < self.settled:
+            count, first, last = self._num_cycles(state) * (self.removals + 1), self.end, self.settled
+        else:
+            return math.inf
+        part = int((progress - first) / (last - first) * count - _TOLERANCE)
+        return min(last, first + (last - first) * (part + 1) / count - _TOLERANCE)
+
+    def _num_cycles(self, state: FitState) -> int:
+        return max(1, round((self.settled - self.end) * state.expected_iterations / self.cycle))
 
     @torch.no_grad()
-    def apply(self, state: FitState) -> None:
-        """Add or remove Gaussians."""
+    def act(self, state: FitState) -> None:
+        """Add or remove Gaussians, once a state was measured."""
         target = self.target(state)
+        if not state.history or target == state.num_requested:
+            return
+        state.waits = True
         if target < state.num_requested:
             remove_gaussians(state, state.num_gaussians - target)
         else:
             state.num_additions += 1
             if self.contours is not None and state.progress < self.end:
-                self.contours.apply(state)
+                self.contours.adapt(state)
             self.add(state, target - state.num_gaussians)
         state.num_requested = target
 
     def add(self, state: FitState, count: int) -> None:
         """Add so many Gaussians, if any."""
         if count > 0:
-            state.optimizer.append(state.scene.field, self.propose(state, count))
+            state.optimizer.append(state.field, self.propose(state, count))
 
     def propose(self, state: FitState, count: int) -> GaussianField:
         """Return the Gaussians to add."""
-        problem, residual = state.problem, state.problem.image - render(state)
-        regions, backend = state.scene.regions, problem.config.backend
-        return propose_gaussians(problem.objective, residual, regions, count, backend)
-
-
-@dataclass(frozen=True)
-class DensifyAtLargestError(Densify):
-    """Add Gaussians at pixels that are sampled in proportion to their squared error, as Image-GS does."""
-
-    steps: int = 4
-    end: float = 0.2
-    surplus: float = 0.0
-
-    def propose(self, state: FitState, count: int) -> GaussianField:
-        """Return round Gaussians of half the spacing, of the colour that their pixel lacks."""
-        problem, regions = state.problem, state.scene.regions
-        error = squared_error(state).flatten().double().cpu().numpy() + 1e-12
-        rng = np.random.default_rng((problem.seed, state.num_additions))
-        pixels = torch.from_numpy(sample_pixels(error, count, rng)).to(problem.image.device)
-        width = problem.size[1]
-        means = torch.stack([pixels % width, pixels // width], -1).to(problem.image.dtype) + 0.5
-        sigma = means.new_full((count,), initial_sigma(problem.size, problem.num_gaussians))
-        colors = (problem.image - render(state)).flatten(1)[:, pixels].T
-        ids = None if regions is None else lookup_regions(means, regions.labels)
-        cholesky = torch.stack([sigma, torch.zeros_like(sigma), sigma], -1)
-        return GaussianField(means, cholesky, colors, ids, size=problem.size)
+        return propose_for(state.objective, state.render().detach(), state.canvas, count)

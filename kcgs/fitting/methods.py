@@ -1,0 +1,55 @@
+"""The optimizers of a fit by their names, with all that differs between them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from kcgs.nn import GaussianField
+from kcgs.optim import GaussianAdam
+from kcgs.optim.descent import FieldOptimizer
+from kcgs.optim.gaussian_adam import COLOR_LEARNING_RATE, LEARNING_RATE
+from kcgs.optim.run import cosine_decay
+
+from .config import FitConfig
+from .published.gaussian_image import GaussianImageAdan
+from .published.image_gs import ImageGSAdam
+
+
+class Method(NamedTuple):
+    """An optimizer, and how a fit uses it."""
+
+    make_optimizer: Callable[[FitConfig, GaussianField, float], FieldOptimizer]
+    """For Gaussians that begin so many pixels wide."""
+    rate: Callable[[float], float]
+    """Factor of the learning rates, by progress."""
+    has_drafts: bool
+    """True where most of the fit has a larger cutoff, and its state may go on with other Gaussians."""
+
+
+def method_of(config: FitConfig) -> Method:
+    """Return the method of the settings; one of the user's own makes an optimizer of a field."""
+    make = config.optimizer
+    return Method(lambda config, field, sigma: make(field), cosine_decay, True) if callable(make) else _METHODS[make]
+
+
+def _gaussian_adam(config: FitConfig, field: GaussianField, sigma: float) -> FieldOptimizer:
+    factor = config.learning_rate_factor
+    return GaussianAdam(
+        field, LEARNING_RATE * factor, color_lr=COLOR_LEARNING_RATE * factor, min_sigma=config.min_sigma
+    )
+
+
+def _adan(config: FitConfig, field: GaussianField, sigma: float) -> FieldOptimizer:
+    return GaussianImageAdan(field, sigma, config.usual_iterations, config.learning_rate_factor)
+
+
+def _adam(config: FitConfig, field: GaussianField, sigma: float) -> FieldOptimizer:
+    return ImageGSAdam(field, config.learning_rate_factor)
+
+
+_METHODS = {
+    "gaussian-adam": Method(_gaussian_adam, cosine_decay, True),
+    "adan": Method(_adan, GaussianImageAdan.rate, False),
+    "adam": Method(_adam, lambda progress: 1.0, False),
+}

@@ -1,0 +1,38 @@
+"""Image-GS's densification."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from kcgs.fitting.events import Densify
+from kcgs.fitting.initial import initial_sigma
+from kcgs.fitting.state import FitState
+from kcgs.functional import lookup_regions
+from kcgs.nn import GaussianField
+
+from .sampling import sample_pixels
+
+
+@dataclass(frozen=True)
+class DensifyAtLargestError(Densify):
+    """Add Gaussians at pixels that are sampled in proportion to their squared error, as Image-GS does."""
+
+    steps: int = 4
+    end: float = 0.2
+    surplus: float = 0.0
+
+    def propose(self, state: FitState, count: int) -> GaussianField:
+        """Return round Gaussians of half the spacing, of the colour that their pixel lacks."""
+        problem, (_, width) = state.problem, state.problem.size
+        residual = state.objective.residual(state.render().detach()).error
+        error = residual.square().mean(0).flatten().double().cpu().numpy() + 1e-12
+        rng = np.random.default_rng((problem.seed, state.num_additions))
+        pixels = torch.from_numpy(sample_pixels(error, count, rng)).to(residual.device)
+        means = torch.stack([pixels % width, pixels // width], -1).to(residual.dtype) + 0.5
+        sigma = means.new_full((count,), initial_sigma(problem.size, problem.num_gaussians))
+        ids = None if state.regions is None else lookup_regions(means, state.regions.labels)
+        cholesky = torch.stack([sigma, torch.zeros_like(sigma), sigma], -1)
+        return GaussianField(means, cholesky, residual.flatten(1)[:, pixels].T, ids, size=problem.size)

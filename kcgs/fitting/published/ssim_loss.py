@@ -1,0 +1,23 @@
+"""Image-GS's objective."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from kcgs.functional import ssim
+from kcgs.optim.objectives import AbsoluteError
+
+# of 1 - SSIM beside the mean absolute error
+_SSIM_WEIGHT = 0.1
+
+
+class AbsoluteAndSsim(AbsoluteError):
+    """L1 + 0.1 (1 - SSIM); its value is L1 alone."""
+
+    def slope(self, render: Tensor) -> Tensor:
+        """Return the gradient, times the number of values."""
+        leaf = render.clone().requires_grad_()
+        with torch.enable_grad():
+            (slope,) = torch.autograd.grad(ssim(leaf, self.image), leaf)
+        return super().slope(render).sub_(_SSIM_WEIGHT * leaf.numel() * slope)

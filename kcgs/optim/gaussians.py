@@ -1,0 +1,82 @@
+"""Gaussians as plain tensors, and what they are rendered with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from kcgs.functional import RegionMap, region_splat
+from kcgs.functional.splat import squared_error_gradients
+from kcgs.functional.weights import inner_products, weighted_sums
+from kcgs.nn import GaussianField
+
+# Cutoff of descents whose result is rendered with a smaller one: it saves a third of the weights of 1e-4.
+_DRAFT_CUTOFF = 1e-3
+
+
+def draft_cutoff(cutoff: float) -> float:
+    """Return the cutoff of a descent whose result is rendered with another."""
+    return max(cutoff, _DRAFT_CUTOFF)
+
+
+class Gaussians(NamedTuple):
+    """The numbers of the Gaussians of one image, or a gradient by each of them."""
+
+    means: Tensor  # [N, 2]
+    cholesky: Tensor  # [N, 3]
+    colors: Tensor  # [N, C]
+    region_ids: Tensor | None = None  # [N]
+
+    @classmethod
+    def of(cls, field: GaussianField) -> Gaussians:
+        """Take those of a field, without the graph; opacities are merged into the colours."""
+        return cls(field.means.detach(), field.cholesky.detach(), field.merged_colors().detach(), field.region_ids)
+
+    def field(self, size: tuple[int, int]) -> GaussianField:
+        """Copy them into a field."""
+        return GaussianField(*self, size=size)
+
+    def map(self, function: Callable[..., Tensor], *others: Gaussians) -> Gaussians:
+        """Apply a function to means, factors and colours, each with those of others; the ids stay."""
+        tables = zip(self[:3], *(other[:3] for other in others), strict=True)
+        means, cholesky, colors = (function(*numbers) for numbers in tables)
+        return Gaussians(means, cholesky, colors, self.region_ids)
+
+
+class Canvas(NamedTuple):
+    """What Gaussians are rendered with."""
+
+    size: tuple[int, int]
+    regions: RegionMap | None = None
+    cutoff: float = _DRAFT_CUTOFF
+    backend: str = "auto"
+    bounds: tuple[Tensor, Tensor] | None = None
+    """Values to which the render is clipped, (C, H, W) or scalars; a clipped value has no gradient."""
+
+    def render(self, gaussians: Gaussians) -> Tensor:
+        """Render (C, H, W)."""
+        render = region_splat(*gaussians, self.regions, size=self.size, cutoff=self.cutoff, backend=self.backend)
+        return render if self.bounds is None else render.clamp(*self.bounds)
+
+    def squared_error(self, gaussians: Gaussians, image: Tensor) -> Tensor:
+        """Return the squared error of each pixel, (H, W), channels averaged."""
+        return (self.render(gaussians).detach() - image).square().mean(0)
+
+    def squared_error_gradients(self, gaussians: Gaussians, image: Tensor) -> Gaussians:
+        """Return half the gradients of the squared error of the render as it is, summed over pixels, in one pass."""
+        return Gaussians(
+            *squared_error_gradients(image, *gaussians, self.regions, cutoff=self.cutoff, backend=self.backend)
+        )
+
+    def inner_products(self, gaussians: Gaussians) -> Tensor:
+        """Sum the render over the weights of each Gaussian, (N, C)."""
+        return inner_products(*gaussians, self.regions, size=self.size, cutoff=self.cutoff, backend=self.backend)
+
+    def weight_sums(self, gaussians: Gaussians) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+        """Sum weights per pixel, (1, H, W); return also what sums such maps per Gaussian, (N,): see `weighted_sums`."""
+        ones = torch.ones_like(gaussians.colors[:, :1])
+        total, sums = weighted_sums(lambda colors: self.render(gaussians._replace(colors=colors)), ones)
+        return total, lambda values: sums(values)[:, 0]

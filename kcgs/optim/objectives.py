@@ -1,0 +1,161 @@
+"""What a descent lowers, as a function of the render."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import l1_loss, mse_loss
+
+from kcgs.errors import InvalidArgument
+
+from .gaussians import Canvas, Gaussians
+
+Loss = Callable[[Tensor], Tensor]
+
+# steps along the slope of a loss that are tried, each half as long as the one before
+_NUM_STEPS = 10
+
+
+class Residual(NamedTuple):
+    """What a render lacks, by the root of what each pixel counts: Gaussians of these colours are by it too large."""
+
+    error: Tensor  # [C, H, W], its square is what a Gaussian may gain
+    root: Tensor | float = 1.0  # [H, W]
+
+
+class Objective(ABC):
+    """An error of a render; subclasses say of which kind.
+
+    Args:
+        image: (C, H, W), what the render should be.
+    """
+
+    is_ranked_by_psnr = True
+    """The best state of a descent has the highest PSNR; False: the lowest value."""
+
+    def __init__(self, image: Tensor) -> None:
+        self.image = image
+
+    @abstractmethod
+    def slope(self, render: Tensor) -> Tensor:
+        """Return half the gradient at a render, (C, H, W), in whose memory it may be.
+
+        A factor is nothing to Adam. Newton's method takes half of the squared error's.
+        """
+
+    @abstractmethod
+    def value(self, render: Tensor) -> Tensor:
+        """Return the mean error of a render, (C, H, W), as a scalar on its device."""
+
+    def weigh(self, gaussians: Gaussians) -> Tensor:
+        """Return about what the squared error of each Gaussian weighs, (N,)."""
+        return torch.ones_like(gaussians.means[:, 0])
+
+    def residual(self, render: Tensor) -> Residual:
+        """Return what a render, (C, H, W), lacks."""
+        return Residual(self.image - render)
+
+    def takes_one_pass(self, canvas: Canvas) -> bool:
+        """Whether gradients need no render of their own."""
+        return False
+
+    def gradients(self, canvas: Canvas, gaussians: Gaussians, render: Tensor | None = None) -> Gaussians:
+        """Return half the gradients by Gaussians; a render with a graph to them may be given."""
+        leaves = gaussians
+        if render is None:
+            leaves = gaussians.map(lambda table: table.detach().requires_grad_())
+            with torch.enable_grad():
+                render = canvas.render(leaves)
+        # `data`: the slope may overwrite it, which the graph does not mind
+        return Gaussians(*torch.autograd.grad(render, leaves[:3], self.slope(render.data)))
+
+
+class SquaredError(Objective):
+    """The squared error, with a weight of each pixel, (H, W), if there is one."""
+
+    def __init__(self, image: Tensor, weight: Tensor | None = None) -> None:
+        super().__init__(image)
+        self.weight = weight
+
+    def slope(self, render: Tensor) -> Tensor:
+        """Return the difference, in the memory of the render: new memory would take as long as the sum."""
+        difference = render.sub_(self.image)
+        return difference if self.weight is None else difference.mul_(self.weight)
+
+    def value(self, render: Tensor) -> Tensor:
+        """Return the mean squared error."""
+        if self.weight is None:
+            return mse_loss(render, self.image)
+        return (self.weight * (render - self.image).square()).mean()
+
+    def takes_one_pass(self, canvas: Canvas) -> bool:
+        """Whether the error is that of all pixels of the render as it is."""
+        return self.weight is None and canvas.bounds is None
+
+    def gradients(self, canvas: Canvas, gaussians: Gaussians, render: Tensor | None = None) -> Gaussians:
+        """Render and differentiate at once, where that is possible."""
+        if render is None and self.takes_one_pass(canvas):
+            return canvas.squared_error_gradients(gaussians, self.image)
+        return super().gradients(canvas, gaussians, render)
+
+
+class AbsoluteError(Objective):
+    """The mean absolute error."""
+
+    def slope(self, render: Tensor) -> Tensor:
+        """Return the sign of the difference."""
+        return render.sub_(self.image).sign_()
+
+    def value(self, render: Tensor) -> Tensor:
+        """Return the mean absolute error."""
+        return l1_loss(render, self.image)
+
+
+class LossObjective(Objective):
+    """A loss of the user's.
+
+    Args:
+        loss: from a render, (1, C, H, W), to a scalar.
+        image: (C, H, W), whose difference from the render is where Gaussians are added; None: the loss says where.
+    """
+
+    is_ranked_by_psnr = False
+
+    def __init__(self, loss: Loss, image: Tensor | None = None) -> None:
+        self.loss, self.target = loss, image
+
+    def slope(self, render: Tensor) -> Tensor:
+        """Return the gradient, times the number of values, as if the loss were their mean."""
+        leaf = render.detach().requires_grad_()
+        with torch.enable_grad():
+            loss = self._check(self.loss(leaf[None]))
+        if not loss.requires_grad:
+            raise InvalidArgument("objective", "a loss that depends on the render", "one without a graph")
+        return torch.autograd.grad(loss, leaf)[0] * leaf.numel()
+
+    @torch.no_grad()
+    def value(self, render: Tensor) -> Tensor:
+        """Return the loss."""
+        return self._check(self.loss(render.detach()[None]))
+
+    def residual(self, render: Tensor) -> Residual:
+        """Return what the render lacks of the image; without one, the step along the slope that lowers the loss most.
+
+        The longest that is tried changes one value by 1.
+        """
+        if self.target is not None:
+            return Residual(self.target - render)
+        slope = self.slope(render)
+        steps = [slope * (-(0.5**k) / slope.abs().max()) for k in range(_NUM_STEPS)]
+        return Residual(min(steps, key=lambda step: float(self.value(render + step))))
+
+    @staticmethod
+    def _check(loss: object) -> Tensor:
+        if not isinstance(loss, Tensor) or loss.numel() != 1:
+            received = f"shape {tuple(loss.shape)}" if isinstance(loss, Tensor) else type(loss).__name__
+            raise InvalidArgument("objective", "a function that returns a scalar tensor", received)
+        return loss.reshape(())

@@ -1,0 +1,94 @@
+"""The loop of every descent: steps, and what happens between them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Protocol, runtime_checkable
+
+# the rate at the end of a descent by Adam, in units of that at its start
+_FINAL_DECAY = 0.1
+
+
+class Descent(Protocol):
+    """Gaussians on their way to less error."""
+
+    iteration: int
+    progress: float  # share of the descent that is over
+
+    def step(self, rate: float) -> None:
+        """Move them once, and count the iteration; `rate` is a share of the stepper's own."""
+
+
+@runtime_checkable
+class Event(Protocol):
+    """Something that happens to descents of some kind from time to time."""
+
+    def due(self, descent: Any) -> float:
+        """Return the progress from which on it acts next; asked at the start, and each time it has acted."""
+
+    def act(self, descent: Any) -> str | None:
+        """Change or observe the descent; return why it ends here, or None."""
+
+
+def run(
+    descent: Descent, progress: Callable[[], float], events: Sequence[Event], rate: Callable[[float], float]
+) -> str:
+    """Step until an event gives a reason to end; return the reason.
+
+    Args:
+        descent: what moves.
+        progress: share of the descent that is over, from 0 to 1.
+        events: act before a step, in this order, if they are due.
+        rate: of the steps, by progress.
+    """
+    due = [event.due(descent) for event in events]
+    while True:
+        descent.progress = progress()
+        for k, event in enumerate(events):
+            if descent.progress >= due[k]:
+                if reason := event.act(descent):
+                    return reason
+                due[k] = event.due(descent)
+        descent.step(rate(descent.progress))
+
+
+def count_iterations(descent: Descent, iterations: float) -> Callable[[], float]:
+    """Return a progress that is the share of so many iterations."""
+    return lambda: descent.iteration / iterations if iterations else 1.0
+
+
+class End:
+    """Ends a descent at a share of it."""
+
+    def __init__(self, until: float = 1.0) -> None:
+        self.until = until
+
+    def due(self, descent: Descent) -> float:
+        """See :class:`Event`."""
+        return self.until
+
+    def act(self, descent: Descent) -> str | None:
+        """See :class:`Event`."""
+        return "iterations"
+
+
+class At:
+    """Acts once at each of some shares of a descent, which ascend."""
+
+    def __init__(self, times: Iterable[float], action: Callable[[], None]) -> None:
+        self._times, self._action = iter([*times, math.inf]), action
+
+    def due(self, descent: Descent) -> float:
+        """See :class:`Event`."""
+        return next(self._times)
+
+    def act(self, descent: Descent) -> None:
+        """See :class:`Event`."""
+        self._action()
+
+
+def cosine_decay(progress: float) -> float:
+    """Return a factor that falls along a cosine from 1 to a tenth."""
+    cosine = 0.5 * (1 + math.cos(math.pi * min(max(progress, 0.0), 1.0)))
+    return _FINAL_DECAY + (1 - _FINAL_DECAY) * cosine
