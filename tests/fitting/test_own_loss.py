@@ -1,0 +1,167 @@
+"""A fit of a loss of the user's, and other objects of one's own in place of names."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from kcgs import RegionMap, RegionSplatRenderer, fit
+from kcgs.fitting import initial_field, lowest_impact, propose_gaussians
+from kcgs.fitting.state import FitState
+from kcgs.functional import psnr
+from kcgs.optim import GaussianAdam
+from kcgs.rate import fit_bytes
+from kcgs.video import fit_video
+
+LABELS = (torch.arange(40) > 17).long().expand(32, 40)
+
+
+def image() -> Tensor:
+    y, x = torch.meshgrid(torch.arange(32.0), torch.arange(40.0), indexing="ij")
+    return torch.stack([(0.3 * x).sin(), (0.2 * y).cos(), (0.1 * x * y).sin()]).mul(0.4).add(0.5)
+
+
+def l1(render: Tensor) -> Tensor:
+    assert render.shape == (1, 3, 32, 40)
+    return (render - image()).abs().mean()
+
+
+def squared(render: Tensor) -> Tensor:
+    return (render - image()).square().mean()
+
+
+class TestLoss:
+    @pytest.mark.parametrize("regions", [None, LABELS])
+    def test_l1_is_the_loss_of_that_name(self, regions: Tensor | None) -> None:
+        own, named = (fit(image(), regions, 60, iterations=150, **s) for s in ({"objective": l1}, {"loss": "l1"}))
+        assert max(e.psnr for e in own.history) > max(e.psnr for e in named.history) - 0.3
+        assert own.history[-1].loss == pytest.approx(named.history[-1].loss, rel=0.1)
+        best = min(entry.loss for entry in own.history[-20:])
+        assert float(l1(own.scene()[None]).detach()) == pytest.approx(best, rel=0.02)
+
+    def test_without_an_image_the_loss_says_where_gaussians_are_added(self) -> None:
+        regions = RegionMap.from_labels(LABELS, 0.5)
+        result = fit(None, regions, 60, iterations=150, objective=squared, size=(32, 40))
+        assert result.scene.num_gaussians > 40 and math.isnan(result.history[-1].psnr)
+        assert float(psnr(result.scene().detach(), image())) > 18 and result.scene.regions.num_regions == 2
+        assert torch.equal(result.scene.regions.labels, LABELS)
+
+    def test_channels(self) -> None:
+        target = image()[:1]
+        result = fit(
+            None, None, 20, iterations=40, objective=lambda r: (r - target).square().mean(), size=(32, 40), channels=1
+        )
+        assert result.scene().shape == (1, 32, 40) and result.history[-1].loss < 0.5 * result.history[0].loss
+
+    @pytest.mark.parametrize(
+        ("change", "words"),
+        [
+            ({"checkpoint": "state"}, "checkpoint must be None with objective of your own, which no file keeps"),
+            ({"objective": lambda render: render.mean((2, 3))}, r"objective must be a function that returns a scalar"),
+            (
+                {"objective": lambda render: render.detach().mean()},
+                "objective must be a loss that depends on the render",
+            ),
+            ({"image": None}, r"size must be \(height, width\) without an image; got None"),
+            ({"image": None, "size": (32, 40), "target_psnr": 20.0}, "target_psnr must be None without an image"),
+            ({"size": (32, 40)}, "size must be None with an image"),
+            ({"objective": "l1"}, "objective must be 'auto', 'psnr' or 'ms-ssim'; got 'l1'"),
+        ],
+    )
+    def test_bad_arguments(self, change: dict[str, Any], words: str) -> None:
+        with pytest.raises(ValueError, match=words):
+            fit(**{"image": image(), "num_gaussians": 5, "objective": l1, "iterations": 3, **change})
+
+    def test_files_and_videos_take_names(self) -> None:
+        with pytest.raises(ValueError, match="objective must be 'psnr' or 'ms-ssim' with target_bytes"):
+            fit_bytes(image(), None, 300, objective=l1)
+        with pytest.raises(ValueError, match="objective must be a name: frames differ"):
+            fit_video([image()], objective=l1)
+
+
+@dataclass(frozen=True)
+class AddAll:
+    """Adds all Gaussians at the middle of a fit."""
+
+    def due(self, state: FitState) -> float:
+        return math.inf if state.num_additions else 0.5
+
+    def act(self, state: FitState) -> None:
+        state.waits, state.num_additions = True, state.num_additions + 1
+        error = state.problem.image - state.render().detach()
+        state.optimizer.append(state.field, propose_gaussians(error, 30, state.regions))
+
+
+def test_an_event_and_an_optimizer_of_ones_own(tmp_path: Path) -> None:
+    settings: dict[str, Any] = {"densify": AddAll(), "optimizer": lambda field: GaussianAdam(field, 0.05)}
+    counts: list[int] = []
+    result = fit(image(), LABELS, 60, iterations=60, on_step=lambda i, e: counts.append(e.num_gaussians), **settings)
+    assert counts[28] == 2 and counts[-1] == 32 and result.history[-1].psnr > result.history[0].psnr + 5
+    with pytest.raises(ValueError, match="checkpoint must be None with densify of your own"):
+        fit(image(), LABELS, 60, checkpoint=tmp_path / "state", **settings)
+
+
+class TestLoop:
+    """The two steps of a loop of one's own."""
+
+    @pytest.mark.parametrize("regions", [None, LABELS])
+    def test_additions_and_removals(self, regions: Tensor | None) -> None:
+        field, renderer = initial_field(image(), 6, regions), RegionSplatRenderer()
+        optimizer, values = GaussianAdam(field), []
+        for step in range(60):
+            if step % 10 == 5:
+                mask, colors = lowest_impact(field, max(0, field.num_gaussians - 40), regions)
+                field.colors.data = colors
+                optimizer.keep(field, ~mask)
+                error = image() - renderer(field, regions).detach()
+                optimizer.append(field, propose_gaussians(error[None], 12, regions))
+            optimizer.zero_grad()
+            values.append(l1(renderer(field, regions)[None]))
+            values[-1].backward()
+            optimizer.step()
+        assert field.num_gaussians <= 52 and values[-1] < 0.35 * values[4]
+
+    @pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
+    def test_dtypes(self, dtype: torch.dtype) -> None:
+        assert propose_gaussians((image() - 0.5).to(dtype), 5).num_gaussians == 5
+
+    @pytest.mark.parametrize(
+        ("arguments", "error", "words"),
+        [
+            ((image()[0], 3), ValueError, "error must have 3 or 4 dimensions"),
+            ((image()[None].expand(2, 3, 32, 40), 3), ValueError, "error must be of one image"),
+            ((image() / 0, 3), ValueError, "error must be finite"),
+            ((image(), 0), ValueError, "num_gaussians must be at least 1; got 0"),
+            ((image(), 3, LABELS[1:]), ValueError, "regions must be one map of the image's size"),
+        ],
+    )
+    def test_what_cannot_be_added(self, arguments: Any, error: type[Exception], words: str) -> None:
+        with pytest.raises(error, match=words):
+            propose_gaussians(*arguments)
+
+    @pytest.mark.parametrize(
+        ("arguments", "error", "words"),
+        [
+            ((3, 3), TypeError, "field must be a GaussianField; got int"),
+            ((initial_field(image(), 5), 6), ValueError, r"num_gaussians must be in \[0, 5\]; got 6"),
+            (
+                (initial_field(image(), 5, LABELS), 3),
+                ValueError,
+                "regions must be given where the field has region ids",
+            ),
+            (
+                (initial_field(image(), 5), 3, LABELS),
+                ValueError,
+                "regions must be given where the field has region ids",
+            ),
+        ],
+    )
+    def test_what_cannot_be_removed(self, arguments: Any, error: type[Exception], words: str) -> None:
+        with pytest.raises(error, match=words):
+            lowest_impact(*arguments)
