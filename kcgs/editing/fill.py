@@ -8,7 +8,6 @@ from torch.nn.functional import pad
 
 from kcgs.compiled import threads_for_kernels
 from kcgs.functional import RegionMap, region_splat
-from kcgs.functional.weights import weighted_sums
 from kcgs.nn import GaussianField
 from kcgs.nn.field import join
 from kcgs.optim import GaussianAdam
@@ -54,15 +53,15 @@ def fill_hole(scene: Scene, hole: Tensor, visible: Tensor) -> Scene:
         The scene without the Gaussians of the hole. Gaussians that reach into the hole are fitted to what is around
         it, together with new ones.
     """
-    regions, ids = scene.regions, scene.field.region_ids
-    assert regions is not None and ids is not None
+    regions = scene.regions
+    assert regions is not None
     fill_mask = visible | _fringe(visible, regions.labels)
     unknown = hole | fill_mask
     if not fill_mask.any():
         return scene
     with threads_for_kernels(unknown.numel()), torch.no_grad():
         target = inpaint_from_matches(scene(), unknown)
-        share = _share_in(scene.field, ids, regions, unknown)
+        share = _share_in(scene.field, regions, unknown)
         fixed = scene.field.subset(share <= _FITTED_SHARE)
         fitted = scene.field.subset((share > _FITTED_SHARE) & (share <= _REMOVED_SHARE))
         target = target - Scene(fixed, regions)()
@@ -81,12 +80,10 @@ def _fringe(mask: Tensor, labels: Tensor) -> Tensor:
     return near & torch.isin(labels, labels[mask].unique()) & torch.isin(labels, labels[~near].unique())
 
 
-def _share_in(field: GaussianField, ids: Tensor, regions: RegionMap, hole: Tensor) -> Tensor:
+def _share_in(field: GaussianField, regions: RegionMap, hole: Tensor) -> Tensor:
     """Return the share of the weight of each Gaussian that is in the hole, (N,)."""
-    means, cholesky = field.means.detach(), field.cholesky.detach()
-    ones = torch.ones_like(field.colors[:, :1])
-    total, sums = weighted_sums(lambda colors: region_splat(means, cholesky, colors, ids, regions), ones)
-    return (sums(hole.to(total)[None]) / sums(torch.ones_like(total)).clamp_min(1e-9))[:, 0]
+    total, sums = Canvas(field.size, regions, _CUTOFF).weight_sums(Gaussians.of(field))
+    return sums(hole.to(total)[None]) / sums(torch.ones_like(total)).clamp_min(1e-9)
 
 
 def _spread(residual: Tensor, mask: Tensor, regions: RegionMap, density: float) -> GaussianField:

@@ -29,10 +29,7 @@ class StopAtDivergence:
 
     def due(self, state: FitState) -> float:
         """Return the progress at the next check, or less."""
-        if not state.runs_ahead:
-            return state.progress
-        number = -(-state.iteration // _ITERATIONS_PER_CHECK)
-        return number * _ITERATIONS_PER_CHECK / state.problem.config.max_iterations
+        return state.next_multiple(_ITERATIONS_PER_CHECK) if state.runs_ahead else state.progress
 
     def act(self, state: FitState) -> str | None:
         """Check, warn, and return why the fit ends."""

@@ -16,7 +16,7 @@ from kcgs.errors import InvalidArgument
 from kcgs.kernels import prepare
 from kcgs.optim.run import End, Event, run
 
-from .clock import Clock, EndOfTime
+from .clock import Clock
 from .config import FitConfig
 from .divergence import StopAtDivergence
 from .events.checkpoint import Checkpoint
@@ -168,10 +168,9 @@ def _run(
     def progress() -> float:
         return max(state.iteration / limit, clock.seconds() / max_seconds)
 
-    events: list[Event] = [
-        Report(state, clock, bar, on_step, store), EndOfTime(clock), End(until), StopAtDivergence(),
-        *make_schedule(config), Log(clock),
-    ]  # fmt: skip
+    end = End(until, lambda: "seconds" if clock.seconds() >= max_seconds else "iterations")
+    report = Report(state, clock, bar, on_step, store)
+    events: list[Event] = [report, end, StopAtDivergence(), *make_schedule(config), Log(clock)]
     reason = run(state, progress, events, method_of(config).rate)
     return finish(state, cast(StopReason, reason), clock.seconds())
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from kcgs.nn import GaussianField
 from kcgs.optim import GaussianAdam
-from kcgs.optim.descent import FieldOptimizer
 from kcgs.optim.gaussian_adam import COLOR_LEARNING_RATE, LEARNING_RATE
 from kcgs.optim.run import cosine_decay
 
@@ -19,7 +18,7 @@ from .published.image_gs import ImageGSAdam
 class Method(NamedTuple):
     """An optimizer, and how a fit uses it."""
 
-    make_optimizer: Callable[[FitConfig, GaussianField, float], FieldOptimizer]
+    make_optimizer: Callable[[FitConfig, GaussianField, float], Any]
     """For Gaussians that begin so many pixels wide."""
     rate: Callable[[float], float]
     """Factor of the learning rates, by progress."""
@@ -33,18 +32,18 @@ def method_of(config: FitConfig) -> Method:
     return Method(lambda config, field, sigma: make(field), cosine_decay, True) if callable(make) else _METHODS[make]
 
 
-def _gaussian_adam(config: FitConfig, field: GaussianField, sigma: float) -> FieldOptimizer:
+def _gaussian_adam(config: FitConfig, field: GaussianField, sigma: float) -> Any:
     factor = config.learning_rate_factor
     return GaussianAdam(
         field, LEARNING_RATE * factor, color_lr=COLOR_LEARNING_RATE * factor, min_sigma=config.min_sigma
     )
 
 
-def _adan(config: FitConfig, field: GaussianField, sigma: float) -> FieldOptimizer:
+def _adan(config: FitConfig, field: GaussianField, sigma: float) -> Any:
     return GaussianImageAdan(field, sigma, config.usual_iterations, config.learning_rate_factor)
 
 
-def _adam(config: FitConfig, field: GaussianField, sigma: float) -> FieldOptimizer:
+def _adam(config: FitConfig, field: GaussianField, sigma: float) -> Any:
     return ImageGSAdam(field, config.learning_rate_factor)
 
 

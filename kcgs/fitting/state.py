@@ -96,6 +96,10 @@ class FitState(FieldDescent):
             return config.usual_iterations
         return self.iteration / max(self.progress, 1e-9)
 
+    def next_multiple(self, interval: int) -> float:
+        """Return the progress at this iteration, or the next that is a multiple of the interval, without a clock."""
+        return -(-self.iteration // interval) * interval / self.problem.config.max_iterations
+
     @property
     def is_settled(self) -> bool:
         """True where a render need not wait for the device."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from torch import Tensor
 
@@ -15,35 +15,13 @@ from .newton import Newton, area
 from .objectives import Objective
 
 
-class FieldOptimizer(Protocol):
-    """What a descent needs of an optimizer of a field, such as :class:`GaussianAdam`."""
-
-    @property
-    def param_groups(self) -> list[dict[str, Any]]:
-        """Groups, of which each has a learning rate `lr`."""
-
-    def step(self) -> Any:
-        """Move by the gradients of the field."""
-
-    def append(self, field: GaussianField, added: GaussianField) -> None:
-        """Add the Gaussians of another field."""
-
-    def keep(self, field: GaussianField, mask: Tensor) -> None:
-        """Remove all Gaussians but those of a mask (N)."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return what a checkpoint keeps."""
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take up what a checkpoint kept."""
-
-
 @dataclass
 class FieldDescent:
     """A field that an optimizer moves; events may replace the map, and add and remove Gaussians."""
 
     field: GaussianField
-    optimizer: FieldOptimizer
+    optimizer: Any
+    """A GaussianAdam, or what has its `param_groups`, `step`, `append`, `keep`, `state_dict` and `load_state_dict`."""
     objective: Objective
     canvas: Canvas
     iteration: int = 0

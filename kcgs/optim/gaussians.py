@@ -10,7 +10,6 @@ from torch import Tensor
 
 from kcgs.functional import RegionMap, region_splat
 from kcgs.functional.splat import squared_error_gradients
-from kcgs.functional.weights import inner_products, weighted_sums
 from kcgs.nn import GaussianField
 
 # Cutoff of descents whose result is rendered with a smaller one: it saves a third of the weights of 1e-4.
@@ -72,11 +71,15 @@ class Canvas(NamedTuple):
         )
 
     def inner_products(self, gaussians: Gaussians) -> Tensor:
-        """Sum the render over the weights of each Gaussian, (N, C)."""
-        return inner_products(*gaussians, self.regions, size=self.size, cutoff=self.cutoff, backend=self.backend)
+        """Sum the render over the weights of each Gaussian, (N, C), in one pass where the backend has it."""
+        # the render, less nothing, is what the squared error of a black image is differentiated by
+        black = gaussians.colors.new_zeros(gaussians.colors.shape[1], *self.size)
+        return self.squared_error_gradients(gaussians, black).colors
 
+    @torch.enable_grad()
     def weight_sums(self, gaussians: Gaussians) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
-        """Sum weights per pixel, (1, H, W); return also what sums such maps per Gaussian, (N,): see `weighted_sums`."""
-        ones = torch.ones_like(gaussians.colors[:, :1])
-        total, sums = weighted_sums(lambda colors: self.render(gaussians._replace(colors=colors)), ones)
-        return total, lambda values: sums(values)[:, 0]
+        """Sum weights per pixel, (1, H, W); return also what sums such a map by the weights of each Gaussian, (N,)."""
+        ones = torch.ones_like(gaussians.colors[:, :1]).requires_grad_()
+        total = self.render(gaussians._replace(colors=ones))
+        # the render is linear in the colours, so its gradient by them has the sums
+        return total.detach(), lambda values: torch.autograd.grad(total, ones, values, retain_graph=True)[0][:, 0]

@@ -61,8 +61,8 @@ def count_iterations(descent: Descent, iterations: float) -> Callable[[], float]
 class End:
     """Ends a descent at a share of it."""
 
-    def __init__(self, until: float = 1.0) -> None:
-        self.until = until
+    def __init__(self, until: float = 1.0, reason: Callable[[], str] = lambda: "iterations") -> None:
+        self.until, self.reason = until, reason
 
     def due(self, descent: Descent) -> float:
         """See :class:`Event`."""
@@ -70,7 +70,7 @@ class End:
 
     def act(self, descent: Descent) -> str | None:
         """See :class:`Event`."""
-        return "iterations"
+        return self.reason()
 
 
 class At:

@@ -30,7 +30,7 @@ class Log:
         """Return about when the next measurement is due: not after it is."""
         config = state.problem.config
         if config.max_seconds is None:
-            return -(-state.iteration // _interval(state)) * _interval(state) / config.max_iterations
+            return state.next_multiple(_interval(state))
         return self._due_seconds(state) / config.max_seconds
 
     def act(self, state: FitState) -> None:

@@ -22,18 +22,18 @@ class Warmup:
 
     def due(self, state: FitState) -> float:
         """Return the progress at the next refresh, if no clock runs ahead of the iterations."""
-        iterations = state.problem.config.usual_iterations
-        number = -(-state.iteration // self._interval(state))
-        is_over = state.regions is None or state.iteration > self.until * iterations
-        return math.inf if is_over else number * self._interval(state) / state.problem.config.max_iterations
+        is_over = state.regions is None or state.iteration > self._last(state)
+        return math.inf if is_over else state.next_multiple(self._interval(state))
+
+    def _last(self, state: FitState) -> float:
+        return self.until * state.problem.config.usual_iterations
 
     def _interval(self, state: FitState) -> int:
         return max(1, round(self.every * state.problem.config.usual_iterations))
 
     def act(self, state: FitState) -> None:
         """Read the ids, but leave no region without its last Gaussian: nothing else would feel the error there."""
-        iterations = state.problem.config.usual_iterations
-        if state.iteration % self._interval(state) or not 0 < state.iteration <= self.until * iterations:
+        if state.iteration % self._interval(state) or not 0 < state.iteration <= self._last(state):
             return
         state.waits = True
         field, regions = state.field, state.regions
