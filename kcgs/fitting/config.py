@@ -27,7 +27,7 @@ class FitConfig(BaseModel):
     """Settings of a fit; the defaults are the recipe `best`.
 
     Convention: moments of a fit are fractions of its iterations, so that 500 and 50,000 both make sense. What a
-    strategy or an optimizer needs beyond these are fields of its class.
+    event or an optimizer needs beyond these are fields of its class.
 
     Raises:
         ValueError: an unknown setting, or a value of the wrong type or out of range.

@@ -166,7 +166,7 @@ def _run(
     limit, max_seconds = config.max_iterations, config.max_seconds or math.inf
 
     def progress() -> float:
-        return max(state.iteration / limit, clock.seconds() / max_seconds)
+        return min(1.0, max(state.iteration / limit, clock.seconds() / max_seconds))
 
     end = End(until, lambda: "seconds" if clock.seconds() >= max_seconds else "iterations")
     report = Report(state, clock, bar, on_step, store)

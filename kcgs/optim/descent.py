@@ -1,4 +1,4 @@
-"""The two descents: of a field by a torch optimizer, and of tensors by Newton's method."""
+"""The descent of a field by a torch optimizer."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 
 from .gaussians import Canvas, Gaussians
-from .newton import Newton, area
 from .objectives import Objective
 
 
@@ -64,37 +63,3 @@ class FieldDescent:
         gradients = self.objective.gradients(self.canvas, self.gaussians, rendered)
         field.means.grad, field.cholesky.grad, field.colors.grad = gradients[:3]
         self.optimizer.step()
-
-
-class NewtonDescent:
-    """Gaussians that Newton steps move: unlike Adam's, they leave what is right where it is.
-
-    Args:
-        gaussians: the start.
-        objective: about quadratic.
-        canvas: what they are rendered with.
-        exact: see :func:`kcgs.optim.frame.move`.
-        min_sigma: least standard deviation of a Gaussian after a step, in pixels.
-    """
-
-    def __init__(
-        self, gaussians: Gaussians, objective: Objective, canvas: Canvas, *, exact: bool = True, min_sigma: float = 0.0
-    ) -> None:
-        self.gaussians, self.objective, self.canvas = gaussians, objective, canvas
-        self.newton = Newton(gaussians, exact=exact, min_sigma=min_sigma)
-        self.iteration, self.progress = 0, 0.0
-        self.frozen: Tensor | None = None  # numbers that do not move, bool, (N, 5 + C) or what broadcasts to it
-
-    def step(self, rate: float) -> None:
-        """Move the Gaussians once."""
-        gradients, curvature = self.half_gradients(), self.color_curvature()
-        self.gaussians = self.newton.step(self.gaussians, gradients, curvature, rate, self.frozen)
-        self.iteration += 1
-
-    def half_gradients(self) -> Gaussians:
-        """Return half the gradients of the objective."""
-        return self.objective.gradients(self.canvas, self.gaussians)
-
-    def color_curvature(self) -> Tensor:
-        """Return half the second derivative of the objective by a colour, (N,)."""
-        return area(self.gaussians.cholesky) * self.objective.weigh(self.gaussians)

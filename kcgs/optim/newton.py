@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from .frame import local_gradient, move, widen
-from .gaussians import Gaussians
+from .gaussians import Canvas, Gaussians
+from .objectives import Objective
 
 # half the second derivatives of the squared error by a step in a Gaussian's frame, per energy of the Gaussian: two of
 # the centre, three of the factor (docs/format.md has the derivation)
@@ -25,54 +26,57 @@ _MAX_STEP = 0.2
 _MOMENTUM = 0.9
 
 
-class Newton:
+class NewtonDescent:
     """Newton steps of every number alone, in each Gaussian's frame, with momentum.
 
     A number with a small gradient hardly moves, while Adam moves all numbers about as far.
 
     Args:
-        gaussians: the start, for its shapes.
+        gaussians: the start.
+        objective: about quadratic.
+        canvas: what they are rendered with.
         exact: see :func:`kcgs.optim.frame.move`.
         min_sigma: least standard deviation of a Gaussian after a step, in pixels.
     """
 
-    def __init__(self, gaussians: Gaussians, *, exact: bool = True, min_sigma: float = 0.0) -> None:
-        self.velocity = torch.zeros_like(torch.cat(gaussians[:3], -1))  # [N, 5 + C]
+    def __init__(
+        self, gaussians: Gaussians, objective: Objective, canvas: Canvas, *, exact: bool = True, min_sigma: float = 0.0
+    ) -> None:
+        self.gaussians, self.objective, self.canvas = gaussians, objective, canvas
         self.exact, self.min_sigma = exact, min_sigma
+        self.velocity = torch.zeros_like(torch.cat(gaussians[:3], -1))  # [N, 5 + C]
+        self.frozen: Tensor | None = None  # numbers that do not move, bool, (N, 5 + C) or what broadcasts to it
+        self.iteration, self.progress = 0, 0.0
 
-    def step(
-        self,
-        gaussians: Gaussians,
-        gradients: Gaussians,
-        color_curvature: Tensor,
-        rate: float,
-        frozen: Tensor | None = None,
-    ) -> Gaussians:
-        """Return the Gaussians after a step.
-
-        Args:
-            gaussians: before the step.
-            gradients: half the gradients of the error.
-            color_curvature: half the second derivative of the error by a colour, (N,).
-            rate: share of a Newton step.
-            frozen: numbers that do not move, bool, (N, 5 + C) or what broadcasts to it.
-        """
-        self.velocity = _MOMENTUM * self.velocity + _newton_step(gaussians, gradients, color_curvature)
-        if frozen is not None:
-            self.velocity = torch.where(frozen, 0.0, self.velocity)
+    def step(self, rate: float) -> None:
+        """Move the Gaussians once, by a share of a Newton step."""
+        self.velocity = _MOMENTUM * self.velocity + self._newton_step()
+        if self.frozen is not None:
+            self.velocity = torch.where(self.frozen, 0.0, self.velocity)
+        means, cholesky, colors, region_ids = self.gaussians
         step = rate * self.velocity
-        means, cholesky = move(*gaussians[:2], step[:, :5].clamp(-_MAX_STEP, _MAX_STEP), exact=self.exact)
+        means, cholesky = move(means, cholesky, step[:, :5].clamp(-_MAX_STEP, _MAX_STEP), exact=self.exact)
         if self.min_sigma > 0.0:
             cholesky = widen(cholesky, self.min_sigma)
-        return Gaussians(means, cholesky, gaussians.colors + step[:, 5:], gaussians.region_ids)
+        self.gaussians = Gaussians(means, cholesky, colors + step[:, 5:], region_ids)
+        self.iteration += 1
 
+    def half_gradients(self) -> Gaussians:
+        """Return half the gradients of the objective."""
+        return self.objective.gradients(self.canvas, self.gaussians)
 
-def _newton_step(gaussians: Gaussians, gradients: Gaussians, color_curvature: Tensor) -> Tensor:
-    """Return Newton's steps of centre, factor and colours, (N, 5 + C)."""
-    energy = (gaussians.colors.square().sum(-1) * color_curvature).clamp_min(_MIN_ENERGY)
-    local = local_gradient(gaussians.cholesky, gradients.means, gradients.cholesky)
-    geometry = (local / (energy[:, None] * energy.new_tensor(_CURVATURE))).clamp(-_MAX_NEWTON_STEP, _MAX_NEWTON_STEP)
-    return -torch.cat([geometry, gradients.colors / color_curvature[:, None]], -1)
+    def color_curvature(self) -> Tensor:
+        """Return half the second derivative of the objective by a colour, (N,)."""
+        return area(self.gaussians.cholesky) * self.objective.weigh(self.gaussians)
+
+    def _newton_step(self) -> Tensor:
+        """Return Newton's steps of centre, factor and colours, (N, 5 + C)."""
+        gradients, curvature = self.half_gradients(), self.color_curvature()
+        energy = (self.gaussians.colors.square().sum(-1) * curvature).clamp_min(_MIN_ENERGY)
+        local = local_gradient(self.gaussians.cholesky, gradients.means, gradients.cholesky)
+        geometry = local / (energy[:, None] * energy.new_tensor(_CURVATURE))
+        geometry = geometry.clamp(-_MAX_NEWTON_STEP, _MAX_NEWTON_STEP)
+        return -torch.cat([geometry, gradients.colors / curvature[:, None]], -1)
 
 
 def area(cholesky: Tensor) -> Tensor:

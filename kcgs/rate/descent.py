@@ -11,9 +11,8 @@ from torch import Tensor
 
 from kcgs.codec.gaussians.quantize import Parameters, Quantizer
 from kcgs.codec.scenes import SceneWriter
-from kcgs.optim.descent import NewtonDescent
 from kcgs.optim.gaussians import Canvas, Gaussians
-from kcgs.optim.newton import area
+from kcgs.optim.newton import NewtonDescent, area
 from kcgs.optim.objectives import Objective
 
 from .bits import soft_bits
@@ -105,7 +104,7 @@ class RateDistortionDescent(NewtonDescent):
 
     def _select(self, rows: NDArray[np.bool_]) -> None:
         index = torch.from_numpy(rows)
-        self.ids, self.newton.velocity = self.ids[rows], self.newton.velocity[index]
+        self.ids, self.velocity = self.ids[rows], self.velocity[index]
         self.gaussians = self.gaussians.map(lambda numbers: numbers[index])
         self._bit_gradient = None
 

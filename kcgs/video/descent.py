@@ -13,10 +13,9 @@ from kcgs.fitting.contour_moves import move_contours
 from kcgs.fitting.pursuit import propose_for
 from kcgs.fitting.removal import least_impact
 from kcgs.functional import RegionMap
-from kcgs.optim.descent import NewtonDescent
 from kcgs.optim.gaussians import Canvas, Gaussians, draft_cutoff
 from kcgs.optim.ms_ssim import MsSsim
-from kcgs.optim.newton import area
+from kcgs.optim.newton import NewtonDescent, area
 from kcgs.optim.objectives import SquaredError
 from kcgs.optim.run import At, End, Event, count_iterations, run
 from kcgs.scene import Scene
@@ -117,7 +116,7 @@ class FrameDescent(NewtonDescent):
         mask, new_colors = least_impact(canvas, gaussians, count, weights)
         colors = torch.where(self.movable_rows[:, None], new_colors, gaussians.colors)
         gaussians = gaussians._replace(colors=colors.masked_fill(mask[:, None], 0.0))
-        self.newton.velocity[mask], self.movable_rows = 0.0, self.movable_rows | mask
+        self.velocity[mask], self.movable_rows = 0.0, self.movable_rows | mask
 
         rendered = torch.where(self.changed_pixels, canvas.render(gaussians), self.image)
         added = Gaussians.of(propose_for(self.objective, rendered, canvas, int(mask.sum())))

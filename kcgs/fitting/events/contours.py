@@ -17,7 +17,7 @@ from kcgs.functional import RegionMap, choose_softness
 class AdaptContours:
     """Move the contours before some of the additions of Gaussians, which then adapt to the new contours.
 
-    The strategy `Densify` applies this.
+    The event `Densify` does this.
     """
 
     max_rise: float = 1.5
