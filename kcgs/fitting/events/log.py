@@ -28,26 +28,19 @@ class Log:
 
     def due(self, state: FitState) -> float:
         """Return about when the next measurement is due: not after it is."""
-        config = state.problem.config
-        if config.max_seconds is None:
+        if state.problem.config.max_seconds is None:
             return state.next_multiple(_interval(state))
-        return self._due_seconds(state) / config.max_seconds
+        return state.progress + 1.0 / _HISTORY_LENGTH if state.history or state.pending else 0.0
 
     def act(self, state: FitState) -> None:
         """Measure, and leave the render to the step, which differentiates it."""
-        if state.problem.config.max_seconds is None:
-            is_due = state.iteration % _interval(state) == 0
-        else:
-            is_due = self.clock.seconds() >= self._due_seconds(state)
-        if is_due and state.num_gaussians <= state.problem.num_gaussians:
+        problem = state.problem
+        if problem.config.max_seconds is None and state.iteration % _interval(state):
+            return
+        if state.num_gaussians <= problem.num_gaussians:
             with state.room():
                 state.rendered = state.render()
                 measure(state, state.scene, state.rendered, self.clock.seconds())
-
-    @staticmethod
-    def _due_seconds(state: FitState) -> float:
-        last = state.pending[-1] if state.pending else state.history[-1] if state.history else None
-        return 0.0 if last is None else last.seconds + (state.problem.config.max_seconds or 0.0) / _HISTORY_LENGTH
 
 
 def _interval(state: FitState) -> int:
