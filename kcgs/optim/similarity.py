@@ -30,11 +30,11 @@ class Passes:
     def __init__(self, scales: Sequence[Sequence[NDArray[Any]]], factors: Sequence[float], least: float) -> None:
         self._channels = len(scales[0][0])
         sizes = np.array([scale[0].shape[1:] for scale in scales])
-        halves = (sizes + 1) // 2
-        padded_sizes = np.column_stack([sizes[:, 0] + PADDING, 2 * halves[:, 1] + 9])
-        areas = np.column_stack([side.prod(1) for side in (sizes, padded_sizes, halves)])
+        padded_sizes = sizes + [PADDING, 2 * MARGIN]
+        areas = np.column_stack([side.prod(1) for side in (sizes, padded_sizes, (sizes + 1) // 2)])
         table, taps = np.column_stack([sizes, areas.cumsum(0) - areas]), np.array(window_taps(), np.float32)
-        image = np.concatenate([_pad(scale[0]).ravel() for scale in scales])
+        sides = (0, 0), (MARGIN, PADDING - MARGIN), (MARGIN, MARGIN)
+        image = np.concatenate([np.pad(scale[0], sides).ravel() for scale in scales])
         inside, mean, variance = (
             np.concatenate([scale[k][:, ::2, ::2].ravel() for scale in scales]) for k in (1, 2, 3)
         )
@@ -74,11 +74,3 @@ class Passes:
         arguments = self._scales, difference, squared, sums, tasks is self._tasks
         run_tasks(lambda tasks, counters: run_phases(*arguments, tasks, counters), tasks)
         return sums
-
-
-def _pad(planes: NDArray[Any]) -> NDArray[Any]:
-    """Put the even columns of planes, (C, h, w), before the odd ones, with zeros around them: see `Scales`."""
-    above = (MARGIN, PADDING - MARGIN)
-    even, odd = planes[:, :, ::2], planes[:, :, 1::2]
-    parts = [(even, (2, 2)), (odd, (3, 2 + even.shape[2] - odd.shape[2]))]
-    return np.concatenate([np.pad(part, ((0, 0), above, beside)) for part, beside in parts], 2)

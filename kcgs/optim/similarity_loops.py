@@ -37,9 +37,8 @@ program = Program("objective of MS-SSIM")
 class Scales(NamedTuple):
     """All scales of an image, flat, finest first.
 
-    Windows lie at even rows and columns. `Padded` planes have the even columns of a row first, then the odd ones: the
-    pixels that the windows of a row share are neighbours in memory. Zeros lie around them: 5 rows above and 7 below, 2
-    elements before and after the even columns, 3 before and up to 3 after the odd ones.
+    Windows lie at even rows and columns. Zeros lie around `padded` planes: 5 rows above and 7 below, 5 columns on either
+    side.
     """
 
     table: Any  # [S, 5] int64
@@ -83,11 +82,11 @@ def _down(plane, other, y, taps, upper, lower):  # type: ignore[no-untyped-def]
 @inner
 def _across(row, taps, target):  # type: ignore[no-untyped-def]
     """Blur a row of a padded plane, for the windows of a row."""
-    odd = row[len(target) + 4 :]
     for x in range(len(target)):
-        even_part = taps[0] * row[x + 2] + taps[2] * (row[x + 1] + row[x + 3]) + taps[4] * (row[x] + row[x + 4])
-        odd_part = taps[1] * (odd[x + 2] + odd[x + 3]) + taps[3] * (odd[x + 1] + odd[x + 4])
-        target[x] = even_part + odd_part + taps[5] * (odd[x] + odd[x + 5])
+        k = 2 * x
+        even_part = taps[0] * row[k + 5] + taps[2] * (row[k + 3] + row[k + 7]) + taps[4] * (row[k + 1] + row[k + 9])
+        odd_part = taps[1] * (row[k + 4] + row[k + 6]) + taps[3] * (row[k + 2] + row[k + 8])
+        target[x] = even_part + odd_part + taps[5] * (row[k] + row[k + 10])
 
 
 @inner
@@ -101,12 +100,12 @@ def _up(slopes, k, taps, upper, lower):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _along(row, taps, even, odd):  # type: ignore[no-untyped-def]
-    """Spread windows along a row to its even and odd columns; three zeros lie on either side."""
-    for x in range(len(even)):
+def _along(row, taps, target):  # type: ignore[no-untyped-def]
+    """Spread windows along a row to its columns; three zeros lie on either side."""
+    for x in range(len(target) // 2):
         a, b, c, d, e, f = row[x + 1], row[x + 2], row[x + 3], row[x + 4], row[x + 5], row[x + 6]
-        even[x] = taps[0] * c + taps[2] * (b + d) + taps[4] * (a + e)
-        odd[x] = taps[1] * (c + d) + taps[3] * (b + e) + taps[5] * (a + f)
+        target[2 * x] = taps[0] * c + taps[2] * (b + d) + taps[4] * (a + e)
+        target[2 * x + 1] = taps[1] * (c + d) + taps[3] * (b + e) + taps[5] * (a + f)
 
 
 @inner
@@ -122,7 +121,7 @@ def _plane(scales, scale, channel):  # type: ignore[no-untyped-def]
 def _padded(flat, scales, scale, channel):  # type: ignore[no-untyped-def]
     """Return a padded plane."""
     table = scales.table
-    height, width = table[scale, HEIGHT] + PADDING, (table[scale, WIDTH] + 1) // 2 * 2 + 9
+    height, width = table[scale, HEIGHT] + PADDING, table[scale, WIDTH] + 2 * MARGIN
     start = scales.channels * table[scale, PADDED_START] + channel * height * width
     return flat[start : start + height * width].reshape(height, width)
 
@@ -149,14 +148,9 @@ def _halve(scales, difference, channel, first, last):  # type: ignore[no-untyped
             upper, lower, row = source[2 * y], source[2 * y + 1], target[y]
             for x in range(len(row)):
                 row[x] = quarter * ((upper[2 * x] + lower[2 * x]) + (upper[2 * x + 1] + lower[2 * x + 1]))
-            image_row, render_row = image[y + MARGIN], render[y + MARGIN]
-            gap = (len(row) + 1) // 2 + 7
-            image_odd, render_odd = image_row[gap:], render_row[gap:]
-            for x in range(len(row) // 2):
-                render_row[x + 2] = image_row[x + 2] + row[2 * x]
-                render_odd[x] = image_odd[x] + row[2 * x + 1]
-            if len(row) % 2:
-                render_row[gap - 6] = image_row[gap - 6] + row[-1]
+            image_row, render_row = image[y + MARGIN, MARGIN:], render[y + MARGIN, MARGIN:]
+            for x in range(len(row)):
+                render_row[x] = image_row[x] + row[x]
 
 
 @inner
@@ -242,29 +236,22 @@ def _spread(scales, scale, channel, first, last, slopes):  # type: ignore[no-unt
     image = _padded(scales.image, scales, scale, channel)
     target = _plane(scales, scale, channel)
     width = slopes.shape[2] - 6
-    columns = np.empty((3, 2, width + 6), np.float32)
-    even, odd = np.empty((3, width), np.float32), np.empty((3, width), np.float32)
+    columns, rows = np.empty((3, 2, width + 6), np.float32), np.empty((3, 2 * width), np.float32)
     for top in range(first, last, 2):
         for k in range(3):
             _up(slopes[k], (top - first) // 2, taps, columns[k, 0], columns[k, 1])
         for y in range(top, min(top + 2, last)):
             for k in range(3):
-                _along(columns[k, y - top], taps, even[k], odd[k])
-            _combine(even, render[y + MARGIN, 2:], image[y + MARGIN, 2:])
-            _combine(odd, render[y + MARGIN, width + 7 :], image[y + MARGIN, width + 7 :])
-            row, even_row, odd_row = target[y], even[0], odd[0]
-            for x in range(len(row) // 2):
-                row[2 * x], row[2 * x + 1] = even_row[x], odd_row[x]
-            if len(row) % 2:
-                row[-1] = even_row[width - 1]
+                _along(columns[k, y - top], taps, rows[k])
+            _combine(rows, render[y + MARGIN, MARGIN:], image[y + MARGIN, MARGIN:], target[y])
 
 
 @inner
-def _combine(rows, render, image):  # type: ignore[no-untyped-def]
-    """Set the first of three rows of slopes, by mean square, mean product and mean, to the gradient."""
+def _combine(rows, render, image, target):  # type: ignore[no-untyped-def]
+    """Turn three rows of slopes, by mean square, mean product and mean, into the gradient."""
     by_square, by_product, by_mean = rows[0], rows[1], rows[2]
-    for x in range(min(len(render), len(by_square))):
-        by_square[x] = by_square[x] * render[x] - by_product[x] * image[x] + by_mean[x]
+    for x in range(len(target)):
+        target[x] = by_square[x] * render[x] - by_product[x] * image[x] + by_mean[x]
 
 
 @inner
