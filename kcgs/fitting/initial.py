@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from kcgs._check import check_count
+from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap
+from kcgs.maps import as_region_map
 from kcgs.nn import GaussianField
 
 from .problem import check_image_and_regions, check_num_gaussians
@@ -24,16 +27,18 @@ def initial_field(
     r"""Scatter round Gaussians uniformly over an image, in its colours: the start of a fit, and of a loop of your own.
 
     Convention: standard deviations are half the spacing of the Gaussians, so that together they show a blurred image.
-    No region starts without a Gaussian while another has two. The same seed gives the same field.
+    No region starts without a Gaussian while another has two. The same seed gives the same field. Of a batch of images
+    each gets the field that it gets alone.
 
     Args:
-        image: as :func:`kcgs.fit` takes it.
+        image: as :func:`kcgs.fit` takes it, or a batch, :math:`(B, C, H, W)`.
         num_gaussians: N, from 1 to the number of pixels.
-        regions: label map or RegionMap of the image's size; each Gaussian gets the region under its centre.
+        regions: label map or RegionMap of the image's size, for a batch one for all or one for each image; each
+            Gaussian gets the region under its centre.
         seed: of the random centres.
 
     Returns:
-        A field of N Gaussians, on the device of the image.
+        A field of N Gaussians, on the device of the image; a batch of B of them for :math:`(B, C, H, W)`.
 
     Raises:
         TypeError, ValueError: as :func:`kcgs.fit`.
@@ -44,10 +49,25 @@ def initial_field(
         >>> image = torch.linspace(0.2, 0.8, 48).expand(3, 32, 48)
         >>> bool(psnr(RegionSplatRenderer()(initial_field(image, 60)), image) > 10)
         True
+        >>> initial_field(torch.rand(4, 3, 32, 48), 60).means.shape
+        torch.Size([4, 60, 2])
     """
+    if isinstance(image, Tensor) and image.ndim == 4 and len(image):
+        pairs = zip(image, _split_maps(regions, len(image)), strict=True)
+        return GaussianField.stack([initial_field(one, num_gaussians, labels, seed) for one, labels in pairs])
     image, regions = check_image_and_regions(image, regions)
     count = check_num_gaussians(num_gaussians, image)
     return uniform_field(image, count, regions, check_count("seed", seed, 0, 2**63 - 1))
+
+
+def _split_maps(regions: RegionMap | Tensor | None, count: int) -> Sequence[RegionMap | Tensor | None]:
+    """Return the map of each of so many images."""
+    regions = as_region_map(regions)
+    if regions is None or regions.num_maps is None:
+        return [regions] * count
+    if regions.num_maps not in (1, count):
+        raise InvalidArgument("regions", f"one map, or one for each of {count} images", f"{regions.num_maps} maps")
+    return regions.labels.expand(count, -1, -1).unbind()
 
 
 def uniform_field(image: Tensor, num_gaussians: int, regions: RegionMap | None, seed: int) -> GaussianField:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -20,7 +20,7 @@ from kcgs._check import (
 )
 from kcgs._labels import check_labels
 from kcgs._warn import warn_user
-from kcgs.errors import InvalidArgument
+from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.functional import RegionMap, lookup_regions
 from kcgs.functional.covariance import check_cholesky
 from kcgs.functional.sizes import is_equal
@@ -205,6 +205,40 @@ class GaussianField(nn.Module):
             raise ValueError(f"image needs a batched field; got means of shape {tuple(self.means.shape)}")
         return self._select(index)
 
+    @classmethod
+    def stack(cls, fields: Sequence[GaussianField]) -> GaussianField:
+        """Copy fields of one image each into a batch of parameters, without the graph; :meth:`unbind` is the reverse.
+
+        Args:
+            fields: at least one; alike in number of Gaussians, channels and size, all with region ids or none, and all
+                with opacities or none.
+
+        Raises:
+            TypeError: not GaussianFields.
+            ValueError: no fields, batched ones, or fields that differ.
+
+        Example:
+            >>> batch = GaussianField.stack([GaussianField.random(9, (8, 8), seed=seed) for seed in range(4)])
+            >>> batch.means.shape, [field.num_gaussians for field in batch.unbind()]
+            (torch.Size([4, 9, 2]), [9, 9, 9, 9])
+        """
+        for field in fields:
+            if not isinstance(field, GaussianField):
+                raise InvalidArgumentType("fields", "GaussianFields", type(field).__name__)
+            if field.means.ndim != 2 or _describe(field) != _describe(fields[0]):
+                expected = f"of one image each and alike, the first with {_describe(fields[0])}"
+                raise InvalidArgument("fields", expected, f"one with {_describe(field)}")
+        if not fields:
+            raise InvalidArgument("fields", "at least one", "none", verb="hold")
+        names = ("means", "cholesky", "colors", "region_ids", "opacities")
+        columns = ([getattr(field, name) for field in fields] for name in names)
+        tensors = (None if column[0] is None else torch.stack(column).detach() for column in columns)
+        return cls(*tensors, size=fields[0].size)  # type: ignore[arg-type]
+
+    def unbind(self) -> list[GaussianField]:
+        """Copy each image of a batch, as :meth:`image` does."""
+        return [self.image(index) for index in range(len(self.means))]
+
     def _select(self, index: int | slice | Tensor) -> GaussianField:
         tensors = (self.means, self.cholesky, self.colors, self.region_ids, self.opacities)
         parts = (None if tensor is None else tensor.detach()[index] for tensor in tensors)
@@ -250,6 +284,10 @@ class GaussianField(nn.Module):
         confined = "confined" if self.region_ids is not None else "not confined"
         images = f"{len(self.means)} x " if self.means.ndim == 3 else ""
         return f"{images}{self.num_gaussians} Gaussians, {self.colors.shape[-1]} channels, size={self.size}, {confined}"
+
+
+def _describe(field: GaussianField) -> str:
+    return f"{field.extra_repr()}, {'no ' if field.opacities is None else ''}opacities"
 
 
 def _describe_rows(means: Tensor) -> str:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import asdict, replace
 from typing import Any, NamedTuple, TypeVar
 
+import torch
 from torch import Tensor
 
 from kcgs.errors import InvalidArgument, InvalidArgumentType
@@ -29,13 +30,13 @@ def segment(image: Any, method: str = "auto", **options: Any) -> Tensor:
     ``max_regions``; `method_options` returns its defaults.
 
     Args:
-        image: :math:`(3, H, W)` or :math:`(1, H, W)`, as :func:`kcgs.fit` takes it.
+        image: :math:`(3, H, W)` or :math:`(1, H, W)`, as :func:`kcgs.fit` takes it; or a batch of them.
         method: one of `available_methods`.
         options: of the method and of `Cleanup`.
 
     Returns:
-        :math:`(H, W)` int64 on the device of ``image``. Ids are 0 to R - 1, each in use, by decreasing area; of equal
-        areas, the region with the earlier first pixel comes first.
+        :math:`(H, W)` int64 on the device of ``image``, or :math:`(B, H, W)` for a batch. Ids are 0 to R - 1, each in
+        use, by decreasing area; of equal areas, the region with the earlier first pixel comes first.
 
     Raises:
         TypeError: ``image`` is no image, or the method has no such option.
@@ -49,6 +50,8 @@ def segment(image: Any, method: str = "auto", **options: Any) -> Tensor:
         >>> segment(image)[0, ::20].tolist()
         [1, 0, 0]
     """
+    if isinstance(image, Tensor) and image.ndim == 4 and len(image):
+        return torch.stack([segment(one, method, **options) for one in image])
     return segment_with_scores(image, method, **options).labels
 
 

@@ -109,16 +109,37 @@ class TestInitialField:
         field = initial_field(torch.full((1, 3, 4), 0.5), 5, RegionMap.from_labels(labels), 0)
         assert field.num_gaussians == 5
 
+    @pytest.mark.parametrize("count", [1, 3])
+    @pytest.mark.parametrize("maps", ["none", "one", "each", "float masks", "RegionMap"])
+    def test_a_batch_is_its_images(self, count: int, maps: str) -> None:
+        image, labels = scene()
+        images = torch.stack([image.roll(5 * k, -1) for k in range(count)])
+        each = torch.stack([labels.roll(5 * k, -1) for k in range(count)])
+        regions = {
+            "none": None, "one": labels, "each": each, "float masks": each[:, None].float(),
+            "RegionMap": RegionMap(each),
+        }[maps]  # fmt: skip
+        alone = [None if maps == "none" else labels if maps == "one" else each[k] for k in range(count)]
+        batch = initial_field(images, 40, regions, seed=2)
+        assert batch.means.shape == (count, 40, 2)
+        for k, field in enumerate(batch.unbind()):
+            expected = initial_field(images[k], 40, alone[k], seed=2)
+            assert torch.equal(field.colors, expected.colors) and torch.equal(field.means, expected.means)
+            assert field.region_ids is expected.region_ids or torch.equal(field.region_ids, expected.region_ids)  # type: ignore[arg-type]
+
     @pytest.mark.parametrize(
         ("change", "error", "words"),
         [
+            ({"image": torch.zeros(3, 1, 4, 4), "regions": torch.zeros(2, 4, 4).long()}, ValueError,
+             "regions must be one map, or one for each of 3 images; got 2 maps"),
+            ({"image": torch.zeros(0, 1, 4, 4)}, ValueError, "image must be one image"),
             ({"image": 3}, TypeError, "image must be a Tensor"),
             ({"num_gaussians": 0}, ValueError, "num_gaussians must be at least 1; got 0"),
             ({"num_gaussians": 50}, ValueError, "num_gaussians must be at most 16"),
             ({"regions": torch.zeros(5, 4).long()}, ValueError, "regions must be one map of the image's size"),
             ({"seed": -1}, ValueError, "seed must be in"),
         ],
-    )
+    )  # fmt: skip
     def test_bad_input(self, change: dict[str, object], error: type[Exception], words: str) -> None:
         arguments = {"image": torch.zeros(3, 4, 4), "num_gaussians": 2, **change}
         with pytest.raises(error, match=words):

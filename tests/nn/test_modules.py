@@ -130,6 +130,37 @@ class TestGaussianField(BaseTester):
         total = RegionSplatRenderer()(part, labels) + RegionSplatRenderer()(rest, labels)
         torch.testing.assert_close(total, RegionSplatRenderer()(field, labels))
 
+    @pytest.mark.parametrize("kind", ["plain", "opacities", "double"])
+    def test_stack_and_back(self, field: GaussianField, labels: Tensor, kind: str) -> None:
+        """A batch has what each field has, as leaves of its own."""
+        fields = [field, GaussianField.random(60, SIZE, regions=labels, seed=1)]
+        if kind == "opacities":
+            fields = [GaussianField(f.means, f.cholesky, f.colors, opacities=torch.rand(60), size=SIZE) for f in fields]
+        batch = GaussianField.stack([f.double() if kind == "double" else f for f in fields])
+        assert all(isinstance(p, nn.Parameter) and len(p) == 2 for p in batch.parameters())
+        for one, again in zip(fields, batch.unbind(), strict=True):
+            assert one.size == again.size and one.state_dict().keys() == again.state_dict().keys()
+            assert all(torch.equal(value, again.state_dict()[name]) for name, value in one.state_dict().items()
+                       if isinstance(value, Tensor))  # fmt: skip
+
+    @pytest.mark.parametrize(
+        ("other", "error", "words"),
+        [
+            ([], ValueError, "fields must hold at least one; got none"),
+            ([nn.Linear(2, 3)], TypeError, "fields must be GaussianFields; got Linear"),
+            ([GaussianField.random(60, SIZE), GaussianField.random(59, SIZE)], ValueError, "alike.* 60 .*got .* 59 "),
+            ([GaussianField.random(9, SIZE), GaussianField.random(9, (24, 35))], ValueError, r"alike.*got .*24, 35"),
+            ([GaussianField.random(9, SIZE, regions=torch.ones(SIZE).long()), GaussianField.random(9, SIZE)],
+             ValueError, "with 9 Gaussians.* confined.*got .* not confined"),
+            ([GaussianField.stack([GaussianField.random(9, SIZE)])], ValueError, "one image each.*got one with 1 x 9"),
+        ],
+    )  # fmt: skip
+    def test_exception_stack(self, other: list[GaussianField], error: type[Exception], words: str) -> None:
+        with pytest.raises(error, match=words):
+            GaussianField.stack(other)
+        with pytest.raises(ValueError, match="image needs a batched field"):
+            GaussianField.random(9, SIZE).unbind()
+
     def test_feature(self, field: GaussianField, labels: Tensor) -> None:
         """Opacities are merged into colours."""
         alpha = torch.rand(60)

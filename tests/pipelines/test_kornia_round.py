@@ -9,7 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene, fit
-from kcgs.functional import psnr
+from kcgs.fitting import initial_field
+from kcgs.functional import lookup_regions, psnr
 from kcgs.segment import segment
 
 
@@ -61,6 +62,22 @@ def test_labels_follow_a_geometric_augmentation(photo: Tensor) -> None:
         render = scene.render()[None]
         quality.append(float(kornia.metrics.psnr(render, image, 1.0)))
     assert quality[0] > quality[1] + 1
+
+
+def test_a_batch_of_images_and_masks_is_augmented_together(photo: Tensor) -> None:
+    """Masks come back with whole ids, and start Gaussians of the images that they came back with."""
+    torch.manual_seed(0)
+    images = torch.cat([photo, photo.flip(-1), 1 - photo])
+    labels = segment(images)
+    both = K.AugmentationSequential(
+        K.RandomHorizontalFlip(), K.RandomRotation(20.0, p=1.0), K.RandomResizedCrop((40, 48)), K.ColorJiggle(0.2),
+        data_keys=["image", "mask"],
+    )  # fmt: skip
+    images, masks = both(images, labels[:, None].float())
+    assert masks.shape == (3, 1, 40, 48) and set(masks.unique().tolist()) <= set(labels.unique().tolist())
+    field = initial_field(images, 60, masks)
+    assert torch.equal(field.region_ids, lookup_regions(field.means, masks[:, 0].long()))  # type: ignore[arg-type]
+    assert RegionSplatRenderer()(field, masks).shape == images.shape
 
 
 LINKS = {

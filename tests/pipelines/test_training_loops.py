@@ -37,14 +37,6 @@ def halves() -> Tensor:
     return (torch.arange(SIZE[1]) > 17).long().expand(SIZE).contiguous()
 
 
-def batch_field(dtype: torch.dtype) -> GaussianField:
-    fields = [initial_field(image, 40, halves()) for image in target(2, dtype)]
-    tensors = (
-        torch.stack([getattr(field, name).detach() for field in fields]) for name in ("means", "cholesky", "colors")
-    )
-    return GaussianField(*tensors, torch.stack([f.region_ids for f in fields if f.region_ids is not None]), size=SIZE)
-
-
 def features() -> nn.Module:
     torch.manual_seed(0)
     return nn.Sequential(nn.Conv2d(3, 8, 3, padding=1), nn.GELU(), nn.Conv2d(8, 8, 3, stride=2)).requires_grad_(False)
@@ -88,7 +80,7 @@ class TestLossesFall:
         dtype = torch.float64 if kind == "double" else torch.float32
         image = target(2 if kind == "batch" else 1, dtype).to(device)
         regions = halves().to(device)
-        field = batch_field(dtype) if kind == "batch" else initial_field(image, 40, regions)
+        field = initial_field(image, 40, regions)
         tiled = kind == "tiled" or device.type == "cuda"
         renderer = RegionSplatRenderer(keepdim=False, backend="tiled" if tiled else "auto")
         optimizer = GaussianAdam(field.to(device))
