@@ -341,6 +341,33 @@ class TestGradient:
     def test_gradcheck(self, metric: Metric) -> None:
         BaseTester.gradcheck(metric, small_pair())
 
+    def test_writes_no_image_for_each_tap(self) -> None:
+        """The gradient of a slice is an image of zeros with the slice in it; the filter has 11 taps twice."""
+        image, target = small_pair()
+        value = ssim(image.requires_grad_(), target)
+        with torch.profiler.profile() as profile:
+            value.backward()
+        counts = {event.key: event.count for event in profile.key_averages()}
+        assert 0 < counts["aten::add_"] and counts.get("aten::slice_backward", 0) < 11
+
+    def test_second_derivatives_forward_mode_and_vmap(self) -> None:
+        image, target = (t.double() for t in small_pair())
+        along = torch.linspace(-1, 1, image.numel(), dtype=torch.float64).reshape(image.shape)
+        slope = torch.func.grad(ssim)(image, target)
+        _, rise = torch.func.jvp(lambda i: ssim(i, target), (image,), (along,))
+        self.assert_near(rise, (slope * along).sum())
+        _, change = torch.func.jvp(lambda i: torch.func.grad(ssim)(i, target), (image,), (along,))
+        ahead, behind = (torch.func.grad(ssim)(image + sign * 1e-5 * along, target) for sign in (1, -1))
+        self.assert_near(change, (ahead - behind) / 2e-5)
+        images = torch.stack([image, target, 0.5 * image])
+        self.assert_near(torch.func.vmap(ssim, (0, None))(images, target), ssim(images, target.expand_as(images)))
+        assert torch.autograd.gradgradcheck(lambda i: ssim(i, target), image.requires_grad_(), fast_mode=True)
+
+    @staticmethod
+    def assert_near(value: Tensor, expected: Tensor) -> None:
+        torch.testing.assert_close(value, expected, rtol=1e-6, atol=1e-9)
+        assert expected.any()
+
     def test_ascent_on_ms_ssim(self) -> None:
         image, target = (t.float() for t in photo_pair("coffee", 161, 161))
         image = image.clamp(0.01, 0.99).requires_grad_()
