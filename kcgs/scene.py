@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from numpy.typing import NDArray
@@ -22,6 +22,9 @@ from kcgs.functional import RegionMap
 from kcgs.maps import as_region_map
 from kcgs.nn import GaussianField, RegionSplatRenderer
 from kcgs.nn.renderer import rendered_size
+
+if TYPE_CHECKING:
+    import onnx
 
 # peak memory of a render that is saved: bytes per number of the image, measured
 _IMAGE_BYTES = 12
@@ -139,6 +142,33 @@ class Scene(nn.Module):
     def save(self, path: str | os.PathLike[str]) -> int:
         """Write the scene, as :func:`kcgs.save` does; return the bytes of the file."""
         return save(path, self)
+
+    def to_onnx(self, path: str | os.PathLike[str], **options: Any) -> onnx.ModelProto:
+        """Write the ONNX graph that renders the scene at any size, as Kornia's modules do, and return it.
+
+        Args:
+            path: ends in .onnx; its folder must exist.
+            options: those of :func:`kcgs.onnx.scene_decoder`.
+
+        Raises:
+            TypeError, ValueError: another suffix; as :func:`kcgs.onnx.scene_decoder`.
+            FileNotFoundError: the folder does not exist.
+
+        Example:
+            >>> import tempfile
+            >>> scene = Scene(GaussianField.random(10, (32, 48), seed=0))
+            >>> with tempfile.TemporaryDirectory() as folder:
+            ...     model = scene.to_onnx(f"{folder}/decoder.onnx", clamp=False)
+            >>> [node.name for node in model.graph.output]
+            ['image']
+        """
+        path = Path(path)
+        if path.suffix != ".onnx":
+            raise ValueError(f"path must end in .onnx; got {str(path)!r}")
+        model: onnx.ModelProto = import_module("kcgs.onnx").scene_decoder(self, **options)
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(model.SerializeToString())
+        return model
 
     def __repr__(self) -> str:
         regions = "no regions" if self.regions is None else f"{self.regions.num_regions} regions"

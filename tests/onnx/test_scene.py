@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -299,6 +300,14 @@ class TestModel:
         scene.field.cholesky.data *= 0.2
         stored = scene.save(f"{tmp_path}/s.safetensors")
         assert len(scene_decoder(scene).SerializeToString()) < 2.7 * stored
+
+    def test_a_scene_writes_its_own(self, tmp_path: Path) -> None:
+        scene, path = with_regions("soft", 30, (20, 30), 2), tmp_path / "decoder.onnx"
+        model = scene.to_onnx(path, clamp=False, interactive=True)
+        expected = scene_decoder(scene, clamp=False, interactive=True).SerializeToString()
+        assert path.read_bytes() == model.SerializeToString() == expected
+        with pytest.raises(ValueError, match=r"path must end in .onnx; got '.*decoder.safetensors'"):
+            scene.to_onnx(path.with_suffix(".safetensors"))
 
 
 def batch() -> Scene:
