@@ -19,13 +19,19 @@ from .core.cuda import capture, check_device, count_kernels, finish, megabytes
 from .core.figures import Panel, save_lines
 from .core.goals import Goal, goals_table, missed_goals
 from .core.run import Job, Options, Page, Row
-from .core.scenes import BATCH, FITTED, fits_in, scene_of
+from .core.scenes import BATCH, BATCHES, FITTED, fits_in, scene_of
 from .render import ANISOTROPIES, CUTOFFS, DEFAULT_CUTOFF, differentiate, differentiate_exactly, errors, needles, render
 
 # kernel and device
 METHODS = {"cuda": "cuda", "tiled": "cuda", "cpu": "cpu"}
 # of scenes that slower kernels render, too
-COMPARED = {"W3": ("tiled", "cpu"), "W1": ("tiled", "cpu"), "W2": ("cpu",), "W4": ("cpu",)}
+COMPARED = {
+    "W3": ("tiled", "cpu"),
+    "W1": ("tiled", "cpu"),
+    "W2": ("cpu",),
+    "W4": ("cpu",),
+    **dict.fromkeys(BATCHES, ("cpu",)),
+}
 # standard deviations in pixels, of Gaussians three times as long as wide
 GIANTS = (1e2, 1e4)
 ROUNDS = 20
@@ -52,9 +58,10 @@ place. `cuda` and `tiled` run on the GPU, `cpu` on all cores of the same machine
 the sum of their own times are of one image and its gradients, by torch's profiler; MB is what these add at the peak of
 the GPU's memory. Scenes and needles are those of the report of render; giants are as many Gaussians that wide at least,
 and three times as long. W1, W2 and W3 have hard contours or, by their name, soft ones. `batch` has 64 images of
-128 x 128 with 256 Gaussians each, and a map each or none. dog-1250 and dog-7500 are fits by `best` of the first frame
-of DAVIS dog with its mask, kodim05-10000 one without regions, in DATA/scenes. Errors are the largest, against the
-dense reference in float64 at cutoff 0: of the image / of gradients, relative to the largest of their tensor."""
+128 x 128 with 256 Gaussians each, and a map each or none; batch-B-S has B of S x S with a Gaussian for every 64 pixels.
+dog-1250 and dog-7500 are fits by `best` of the first frame of DAVIS dog with its mask, kodim05-10000 one without
+regions, in DATA/scenes. Errors are the largest, against the dense reference in float64 at cutoff 0: of the image / of
+gradients, relative to the largest of their tensor."""
 
 
 def make_scene(image: str, data: str) -> Scene:
@@ -115,6 +122,7 @@ def jobs(options: Options) -> list[Job]:
     """List errors, then times, then what might disturb times: captures, and counts by the profiler."""
     fits = [] if options.quick else [f"{name} soft" for name in fits_in(options.data)]
     timed = ["W3"] if options.quick else ["W3", "W1", "W1 soft", "W2", *fits, "W4", f"{BATCH} none", BATCH]
+    batches = [] if options.quick else BATCHES
     swept = ["W3"] if options.quick else ["W3", "W1", "W1 soft", *(f"{name} soft" for name in FITTED), *fits[:1]]
     stiff = [*(f"needles {a:g}" for a in ANISOTROPIES), *(f"giants {sigma:g}" for sigma in GIANTS)]
     speed = {"rounds": 1 if options.quick else ROUNDS, "calls": CALLS}
@@ -123,7 +131,8 @@ def jobs(options: Options) -> list[Job]:
         *((image, "cuda", "errors", {"cutoffs": CUTOFFS}) for image in swept),
         *((image, "cuda", "errors", {"cutoffs": (0.0,)}) for image in stiff),
         *((image, "cuda", "times", speed) for image in timed),
-        *((image, method, "times", slow) for image in timed for method in COMPARED.get(image, ())),
+        *((image, "cuda", "times", speed) for image in batches),
+        *((image, method, "times", slow) for image in (*timed, *batches) for method in COMPARED.get(image, ())),
         *((image, "cuda", "captured", speed) for image in timed),
         *((image, "cuda", "kernels", {"calls": CALLS}) for image in timed),
     ]

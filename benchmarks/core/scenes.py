@@ -21,9 +21,9 @@ FITTED = ("rocket-1000", "coffee-1500", "astronaut-3000")
 # fits of photos that do not come with kcgs, in DATA/scenes/NAME.safetensors: of the first frame of DAVIS dog with its
 # mask, and of a photo of Kodak without regions
 FITS = ("dog-1250", "dog-7500", "kodim05-10000")
-# a workload of small images: how many, height, width, N
+# a workload of small images with a Gaussian for every 64 pixels: 64 of 128 x 128, or as many of a side as a suffix says
 BATCH = "batch"
-BATCH_SIZE = (64, 128, 128, 256)
+BATCHES = [f"{BATCH}-{images}-{side}" for images in (16, 64, 256) for side in (64, 128, 256)]
 SIZES = ("native", "3840 wide")
 
 
@@ -33,7 +33,7 @@ def scene_of(name: str, data: str = "") -> Scene:
     "none", "hard" or "soft" behind the name are its contours; soft ones of a fit are its own.
     """
     name, _, contours = name.partition(" ")
-    is_fitted = name not in (*WORKLOADS, BATCH)
+    is_fitted = name not in (*WORKLOADS, BATCH, *BATCHES)
     scene = load(_path(data, name) if name in FITS else find(name)) if is_fitted else _synthetic(name)
     field, regions = scene.field, scene.regions
     if contours == "none" or regions is None:
@@ -57,7 +57,10 @@ def _path(data: str, name: str) -> Path:
 
 
 def _synthetic(name: str) -> Scene:
-    return batch(*BATCH_SIZE) if name == BATCH else workload(*WORKLOADS[name])
+    if name in WORKLOADS:
+        return workload(*WORKLOADS[name])
+    images, side = (int(number) for number in name.split("-")[1:] or (64, 128))
+    return batch(images, side, side, side**2 // 64)
 
 
 def size_of(scene: Scene, size: str) -> tuple[int, int]:
@@ -88,12 +91,7 @@ def workload(height: int, width: int, count: int, seed: int = 0) -> Scene:
 def batch(images: int, height: int, width: int, count: int) -> Scene:
     """Put workloads into a batch, each with its own map: the blocks and the disc of one, moved to the side."""
     scenes = [workload(height, width, count, seed) for seed in range(images)]
-    means, cholesky, colors = (
-        torch.stack([getattr(scene.field, name).detach() for scene in scenes])
-        for name in ("means", "cholesky", "colors")
-    )
-    regions = scenes[0].regions
+    field, regions = GaussianField.stack([scene.field for scene in scenes]), scenes[0].regions
     assert regions is not None
     labels = torch.stack([regions.labels.roll(index, 1) for index in range(images)])
-    field = GaussianField(means, cholesky, colors, lookup_regions(means, labels), size=(height, width))
-    return Scene(field, RegionMap.from_labels(labels))
+    return Scene(field.assign_regions(labels), RegionMap.from_labels(labels))

@@ -256,6 +256,7 @@ def test_scenes() -> None:
     assert images.field.means.shape == (64, 256, 2) and images.render().shape == (64, 3, 128, 128)
     assert images.regions is not None and images.regions.labels.shape == (64, 128, 128)
     assert scene_of("batch none").regions is None
+    assert scene_of("batch-16-64").field.means.shape == (16, 64, 2) and scene_of("batch-16-64").size == (64, 64)
 
 
 def test_fits_of_the_data(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
