@@ -16,7 +16,7 @@ from kcgs.maps import as_region_map
 from kcgs.scene import Scene, check_scene
 
 
-def evaluate(scene: Scene, image: Any, labels: Any = None, *, visual: bool = True) -> dict[str, float]:
+def evaluate(scene: Scene, image: Any, labels: Any = None, *, with_ssimulacra2: bool = True) -> dict[str, float]:
     r"""Render a scene, clipped to [0, 1], and compare it with an image.
 
     Args:
@@ -25,7 +25,7 @@ def evaluate(scene: Scene, image: Any, labels: Any = None, *, visual: bool = Tru
         labels: a map as :func:`kcgs.fit` takes it, with the contours of the edge-focused metrics; None: the scene's
             own, which a fit may have moved. The history of a fit and `kcgs fit` take the map of their input: pass it
             for the same numbers.
-        visual: whether :func:`ssimulacra2` is among the metrics; it takes about 0.3 s for 480 x 854.
+        with_ssimulacra2: whether :func:`ssimulacra2` is among the metrics; it takes about 0.3 s for 480 x 854.
 
     Returns:
         By name: psnr (dB), ssim, ms_ssim, within 5 pixels of the contours ef_psnr (dB) and ef_ssim, and ssimulacra2.
@@ -56,7 +56,7 @@ def evaluate(scene: Scene, image: Any, labels: Any = None, *, visual: bool = Tru
     with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # a map of one region has no contours
         for metric in (ef_psnr, ef_ssim):
             metrics[metric.__name__] = math.nan if regions is None else float(metric(render, target, regions.labels))
-    return {**metrics, "ssimulacra2": ssimulacra2(render, target)} if visual else metrics
+    return {**metrics, "ssimulacra2": ssimulacra2(render, target)} if with_ssimulacra2 else metrics
 
 
 def ssimulacra2(render: Tensor, image: Tensor) -> float:

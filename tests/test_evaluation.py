@@ -90,7 +90,7 @@ class TestSsimulacra2:
         assert all(math.isnan(ssimulacra2(t, t)) for t in (torch.ones(3, 7, 60), torch.ones(4, 40, 60)))
 
     def test_left_out(self) -> None:
-        metrics = evaluate(make_scene(), make_scene().render(), visual=False)
+        metrics = evaluate(make_scene(), make_scene().render(), with_ssimulacra2=False)
         assert "ssimulacra2" not in metrics and metrics["psnr"] == math.inf
 
     def test_without_the_package(self, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -76,7 +76,7 @@ def compare(output: Path, image: Tensor, target_bytes: int, **settings: Any) -> 
         (output / f"{name}.kcgs").write_bytes(result.data)
         save_image(output / f"{name}.png", result.scene.render())
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # MS-SSIM is not shown
-            metrics = evaluate(result.scene, image, labels, visual=False)
+            metrics = evaluate(result.scene, image, labels, with_ssimulacra2=False)
         psnr, ef_psnr, size = f"{metrics['psnr']:.2f}", f"{metrics['ef_psnr']:.2f}", f"{len(result.data):,}"
         table.add_row(name, psnr, ef_psnr, f"{seconds:.1f}", size)
         lines = f"{size} bytes", f"PSNR {psnr} dB, EF-PSNR {ef_psnr} dB"

@@ -167,7 +167,7 @@ def report_fit(
     from kcgs.evaluation import evaluate
 
     with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # the table says it
-        metrics = evaluate(saved_fit.scene, image, labels, visual=False)
+        metrics = evaluate(saved_fit.scene, image, labels, with_ssimulacra2=False)
     target_psnr = request.load_config().target_psnr
     return {
         **metrics,

@@ -123,14 +123,14 @@ class FitConfig(BaseModel):
             raise InvalidArgument("max_move", "'any' or at least 1 pixel", repr(self.max_move))
 
     @property
-    def usual_iterations(self) -> int:
-        """Iterations of a fit without a clock."""
+    def num_iterations(self) -> int:
+        """Iterations of a fit that no clock ends."""
         return self.iterations or _USUAL_ITERATIONS
 
     @property
     def max_iterations(self) -> float:
         """Iterations of a fit; infinite where the clock alone ends it."""
-        return math.inf if self.iterations is None and self.max_seconds is not None else self.usual_iterations
+        return math.inf if self.iterations is None and self.max_seconds is not None else self.num_iterations
 
     def __repr__(self) -> str:
         changed = self.model_dump(exclude_defaults=True)

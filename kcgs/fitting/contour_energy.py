@@ -13,7 +13,15 @@ from kcgs.functional import RegionMap, region_splat
 from kcgs.functional.blur import blur, gaussian_taps
 from kcgs.scene import Scene
 
-from .contour_loops import NOT_COUNTED, CostTable, SweepState, energy_change, list_small_pieces, piece_energy, sweep
+from .contour_loops import (
+    NOT_COUNTED,
+    CostTable,
+    SweepState,
+    find_small_pieces,
+    map_energy_change,
+    piece_energy,
+    sweep_pixels,
+)
 
 Ints = NDArray[np.int64]
 Labels = NDArray[np.int32]
@@ -139,7 +147,9 @@ class MovingLabels:
     def sweep(self, reach: int) -> bool:
         """Give every free pixel near a contour its best label, before pieces are merged; True if one changed."""
         neighborhood = disc(reach, self._stride)
-        return bool(sweep(*self._energy_of, self._limit, self._free, self._list_edges(), neighborhood, self._sweeps))
+        return bool(
+            sweep_pixels(*self._energy_of, self._limit, self._free, self._list_edges(), neighborhood, self._sweeps)
+        )
 
     def _list_edges(self) -> Ints:
         """List the pixels that differ from the one right of them or below, in order."""
@@ -147,7 +157,7 @@ class MovingLabels:
         return np.flatnonzero((here != self._labels[1 : 1 - stride]) | (here != self._labels[stride:]))
 
     def _list_small_pieces(self) -> tuple[Ints, Ints]:
-        pixels, first = list_small_pieces(self._labels, self._list_edges(), self._stride, self._smallest)
+        pixels, first = find_small_pieces(self._labels, self._list_edges(), self._stride, self._smallest)
         return pixels, first
 
     def merge_pieces(self) -> bool:
@@ -183,7 +193,7 @@ class MovingLabels:
 
     def energy_change(self) -> float:
         """Return the energy of the map, less that before all moves."""
-        return float(energy_change(self._before, *self._energy_of))
+        return float(map_energy_change(self._before, *self._energy_of))
 
 
 def _grow(mask: Mask) -> Mask:

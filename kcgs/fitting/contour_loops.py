@@ -64,7 +64,7 @@ def _allows(limit, pixel, label):  # type: ignore[no-untyped-def]
 
 
 @program.entry
-def sweep(labels, costs, pair_cost, disc, limit, free, edges, neighborhood, state):  # type: ignore[no-untyped-def]
+def sweep_pixels(labels, costs, pair_cost, disc, limit, free, edges, neighborhood, state):  # type: ignore[no-untyped-def]
     """Give every free pixel the best label of its neighborhood; True if one changed.
 
     The map is flat and has a rim of -1; `edges` are the pixels that differ from the one right of them or below.
@@ -182,7 +182,7 @@ def piece_energy(labels, costs, pair_cost, disc, limit, piece, label):  # type: 
 
 
 @program.entry
-def energy_change(before, after, costs, pair_cost, disc):  # type: ignore[no-untyped-def]
+def map_energy_change(before, after, costs, pair_cost, disc):  # type: ignore[no-untyped-def]
     """Return the energy of a flat map with a rim of -1, less that of another."""
     change, is_counted = 0.0, np.zeros(len(after), np.bool_)
     for pixel in range(len(after)):
@@ -204,10 +204,10 @@ def energy_change(before, after, costs, pair_cost, disc):  # type: ignore[no-unt
 
 
 @program.entry
-def list_small_pieces(labels, edges, stride, smallest):  # type: ignore[no-untyped-def]
+def find_small_pieces(labels, edges, stride, smallest):  # type: ignore[no-untyped-def]
     """Return the pixels of 4-connected pieces under `smallest` pixels, and the first pixel of each one's piece.
 
-    The map is flat and has a rim of -1; `edges` are as for `sweep`. Every piece has a pixel beside another label: from
+    The map is flat and has a rim of -1; `edges` are as for `sweep_pixels`. Every piece has a pixel beside another label: from
     there it is filled, until it is too large.
     """
     state, queue = np.zeros(len(labels), np.uint8), np.empty(smallest, np.int64)

@@ -121,7 +121,7 @@ def precompile(config: FitConfig, device: torch.device | str = "cpu") -> None:
     ramp = torch.linspace(0.0, 1.0, 96, device=device)
     image = torch.stack([ramp.expand(64, 96), 1 - ramp.expand(64, 96), (8 * ramp).sin().square().expand(64, 96)])
     labels = (ramp > 0.6).long().expand(64, 96).contiguous()
-    iterations = min(config.usual_iterations, 20)
+    iterations = min(config.num_iterations, 20)
     update: dict[str, Any] = {"iterations": iterations, "max_seconds": None, "target_psnr": None, "backend": "auto"}
     if callable(config.objective):  # it may be of one size
         update["objective"] = "auto"

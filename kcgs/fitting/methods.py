@@ -40,7 +40,7 @@ def _gaussian_adam(config: FitConfig, field: GaussianField, sigma: float) -> Any
 
 
 def _adan(config: FitConfig, field: GaussianField, sigma: float) -> Any:
-    return GaussianImageAdan(field, sigma, config.usual_iterations, config.learning_rate_factor)
+    return GaussianImageAdan(field, sigma, config.num_iterations, config.learning_rate_factor)
 
 
 def _adam(config: FitConfig, field: GaussianField, sigma: float) -> Any:

@@ -76,7 +76,7 @@ def _fit(problem: Problem, count: int, trials: list[_Trial], seconds: float, run
     changes = {
         "target_psnr": None,
         "max_seconds": None if math.isinf(seconds) else max(seconds, 1e-3),
-        "iterations": config.usual_iterations,
+        "iterations": config.num_iterations,
     }
     settings = config.model_copy(update=changes)
     nearest = min(trials, key=lambda t: abs(math.log(t.num_gaussians / count)), default=None)
@@ -100,7 +100,7 @@ def _warm_start(problem: Problem, finished: FitState, densify: Densify) -> FitSt
     count, field = problem.num_gaussians, copy.deepcopy(finished.field)
     state = make_state(
         problem, field, finished.regions, count, anchor=finished.anchor, num_additions=finished.num_additions,
-        iteration=round(_WARM_START * problem.config.usual_iterations),
+        iteration=round(_WARM_START * problem.config.num_iterations),
     )  # fmt: skip
     state.optimizer.load_state_dict(copy.deepcopy(finished.optimizer.state_dict()))
     remove_gaussians(state, state.num_gaussians - count)

@@ -93,7 +93,7 @@ class FitState(FieldDescent):
         """About how many iterations the fit will take."""
         config = self.problem.config
         if config.max_seconds is None:
-            return config.usual_iterations
+            return config.num_iterations
         return self.iteration / max(self.progress, 1e-9)
 
     def next_multiple(self, interval: int) -> float:

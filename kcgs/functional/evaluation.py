@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from kcgs.kernels import SplatInputs, Steps, resolve, with_autograd
+from kcgs.kernels import Kernel, SplatInputs, resolve, with_autograd
 from kcgs.maps import membership_at, positions_of
 
 from .arguments import SplatArguments
@@ -21,25 +21,25 @@ from .values import check_region_ids, check_values
 class Plan(NamedTuple):
     """A kernel, its inputs, and what it found about them: a forward leaves it for its backward."""
 
-    steps: Steps
+    kernel: Kernel
     inputs: SplatInputs
-    content: Any  # what `steps.plan` returned
+    content: Any  # what `kernel.plan` returned
 
 
 def plan_splat(arguments: SplatArguments, check: bool = True) -> Plan:
     """Prepare Gaussians and map for the kernel that the backend names, with `check` of values."""
-    inputs, steps = _prepare(arguments, check)
-    content = steps.plan(inputs)
+    inputs, kernel = _prepare(arguments, check)
+    content = kernel.plan(inputs)
     if content is None:
         check_values(*arguments[:3])
-    if steps.looks_up_regions and (content is None or (check and content.foreign)):
+    if kernel.looks_up_regions and (content is None or (check and content.foreign)):
         _look_up(inputs, True)
-    return Plan(steps, inputs, content)
+    return Plan(kernel, inputs, content)
 
 
 def render(arguments: SplatArguments, plan: Plan) -> Tensor:
     """Return the image, with B where the Gaussians have it."""
-    image = plan.steps.render(plan.content, plan.inputs).contiguous()
+    image = plan.kernel.render(plan.content, plan.inputs).contiguous()
     return image if image.ndim == arguments.means.ndim + 1 else image.squeeze(0)
 
 
@@ -48,7 +48,7 @@ def differentiate(arguments: SplatArguments, plan: Plan, grad: Tensor, geometry:
     inputs = plan.inputs
     if grad.ndim < inputs.means.ndim + 1:
         grad = grad.unsqueeze(0)
-    gradients = plan.steps.differentiate(plan.content, inputs, grad, geometry)
+    gradients = plan.kernel.differentiate(plan.content, inputs, grad, geometry)
     means, cholesky, colors = [gradients[2].new_empty(0) if g is None else g.contiguous() for g in gradients]
     if colors.ndim == arguments.colors.ndim:
         return means, cholesky, colors
@@ -58,9 +58,9 @@ def differentiate(arguments: SplatArguments, plan: Plan, grad: Tensor, geometry:
 def error_gradients(arguments: SplatArguments, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the gradients of half the squared error, summed over the pixels, against an image of the same shape."""
     plan = plan_splat(arguments)
-    if plan.steps.error_gradients is None:
+    if plan.kernel.error_gradients is None:
         return differentiate(arguments, plan, render(arguments, plan) - target, True)
-    means, cholesky, colors = plan.steps.error_gradients(plan.content, plan.inputs, target)
+    means, cholesky, colors = plan.kernel.error_gradients(plan.content, plan.inputs, target)
     assert means is not None and cholesky is not None
     return means, cholesky, colors
 
@@ -93,29 +93,29 @@ def differentiate_forward(tangents: tuple[Tensor, Tensor, Tensor], arguments: Sp
 
 def _image_with_graph(arguments: SplatArguments) -> tuple[Tensor, list[Tensor]]:
     """Render with a graph, and return its leaves, too."""
-    inputs, steps = _prepare(arguments, check=False)
-    if steps.image is None:
+    inputs, kernel = _prepare(arguments, check=False)
+    if kernel.image is None:
         raise RuntimeError(
             f"backend {arguments.backend!r} has first derivatives by backward only: backend 'reference' has all"
         )
     leaves = [t.detach().requires_grad_() for t in arguments[:3]]
-    image = steps.image(SplatInputs(leaves[0], leaves[1], leaves[2], *inputs[3:]).with_batch())
+    image = kernel.image(SplatInputs(leaves[0], leaves[1], leaves[2], *inputs[3:]).with_batch())
     return image if arguments.means.ndim == 3 else image.squeeze(0), leaves
 
 
-def _prepare(arguments: SplatArguments, check: bool) -> tuple[SplatInputs, Steps]:
+def _prepare(arguments: SplatArguments, check: bool) -> tuple[SplatInputs, Kernel]:
     """Return the inputs of the kernel, and the kernel."""
     ids = regions = membership = None
     if arguments.map_operands is not None and arguments.region_ids is not None:
         membership, regions = membership_at(arguments.map_operands), arguments.region_ids.contiguous()
         ids = membership.ids
     inputs = SplatInputs(*arguments[:3], regions, membership, arguments.size, arguments.cutoff, ids)
-    steps = resolve(arguments.backend, inputs)
-    if not steps.looks_up_regions:
+    kernel = resolve(arguments.backend, inputs)
+    if not kernel.looks_up_regions:
         inputs = _look_up(inputs, check)
-    if check and not steps.checks_inputs:
+    if check and not kernel.checks_values:
         check_values(*arguments[:3])
-    return inputs if steps.checks_inputs else inputs.with_batch(), steps
+    return inputs if kernel.takes_one_image else inputs.with_batch(), kernel
 
 
 def _look_up(inputs: SplatInputs, check: bool) -> SplatInputs:

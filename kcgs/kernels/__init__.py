@@ -12,10 +12,18 @@ All take the inputs of `interface`, and share `whitened` coordinates.
 """
 
 from .cuda.capacity import settle, without_waiting
-from .interface import SplatInputs, Steps, with_autograd
+from .interface import Kernel, SplatInputs, with_autograd
 from .registry import BACKENDS, check_backend, prepare, resolve, takes_triton
 
 __all__ = [
-    "BACKENDS", "SplatInputs", "Steps", "check_backend", "prepare", "resolve", "settle", "takes_triton",
-    "with_autograd", "without_waiting",
+    "BACKENDS",
+    "Kernel",
+    "SplatInputs",
+    "check_backend",
+    "prepare",
+    "resolve",
+    "settle",
+    "takes_triton",
+    "with_autograd",
+    "without_waiting",
 ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""What a kernel takes and does. Every kernel's module has `steps(inputs)`, which the registry calls."""
+"""What a kernel takes and does. Every kernel's module has `kernel_for(inputs)`, which the registry calls."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Gradients = tuple[Tensor | None, Tensor | None, Tensor]
 
 
 class SplatInputs(NamedTuple):
-    """Arguments of one splat, checked and batched unless the kernel does so itself (`checks_inputs`).
+    """Arguments of one splat, checked and batched unless the kernel does so itself (see `Kernel`).
 
     Floating tensors share one dtype (float32 or float64) and one device.
     """
@@ -51,7 +51,7 @@ class SplatInputs(NamedTuple):
         return SplatInputs(self.means[None], self.cholesky[None], self.colors[None], *self[3:])
 
 
-class Steps(NamedTuple):
+class Kernel(NamedTuple):
     """A kernel: three functions that record no graph, and what only some kernels have.
 
     plan: from the inputs to which Gaussians touch which pixels, in a form of the kernel's own.
@@ -61,8 +61,9 @@ class Steps(NamedTuple):
     image: from the inputs to the image, with a graph of all orders; None: the kernel is differentiable once.
     error_gradients: from (plan, inputs, target) to the gradients of half the squared error against the target,
         (B, C, H, W), in one pass; None: there is none.
-    checks_inputs: `plan` returns None where a value is not finite or beyond the limits in whitened.py, and Gaussians of
-        one image may come without B, as do the results then; else values have been checked, and B is there.
+    checks_values: `plan` returns None where a value is not finite or beyond the limits in whitened.py; else values have
+        been checked.
+    takes_one_image: Gaussians of one image may come without B, as do the results then; else B is there.
     looks_up_regions: `region_index` comes as region ids, with `ids`; negative ones are refused by None, too, and
         `foreign` of the plan is the number of those that the map does not hold.
     """
@@ -72,7 +73,8 @@ class Steps(NamedTuple):
     differentiate: Callable[[Any, SplatInputs, Tensor, bool], Gradients]
     image: Callable[[SplatInputs], Tensor] | None = None
     error_gradients: Callable[[Any, SplatInputs, Tensor], Gradients] | None = None
-    checks_inputs: bool = False
+    checks_values: bool = False
+    takes_one_image: bool = False
     looks_up_regions: bool = False
 
 

@@ -11,16 +11,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .interface import Gradients, SplatInputs, Steps, with_autograd
+from .interface import Gradients, Kernel, SplatInputs, with_autograd
 from .whitened import Z_LIMIT
 
 # weights (pixels times Gaussians) that are evaluated at once: 32 MiB in float64
 _CHUNK_WEIGHTS = 1 << 22
 
 
-def steps(inputs: SplatInputs) -> Steps:
+def kernel_for(inputs: SplatInputs) -> Kernel:
     """Return the kernel."""
-    return Steps(lambda inputs: None, _render, _differentiate, splat)
+    return Kernel(lambda inputs: None, _render, _differentiate, splat)
 
 
 def _render(plan: None, inputs: SplatInputs) -> Tensor:

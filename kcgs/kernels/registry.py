@@ -11,19 +11,19 @@ from torch import Tensor
 from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument
 
-from .interface import SplatInputs, Steps
+from .interface import Kernel, SplatInputs
 
 BACKENDS = ("auto", "reference", "tiled", "cpu", "cuda")
 
 
-def resolve(backend: str, inputs: SplatInputs) -> Steps:
+def resolve(backend: str, inputs: SplatInputs) -> Kernel:
     """Return the kernel that `backend` names for these inputs.
 
     Raises:
         ValueError: inputs that the backend does not take.
     """
     name = _choose(backend, inputs.means.device, inputs.means.dtype)
-    kernel: Steps = import_module(f"{__package__}.{name}").steps(inputs)
+    kernel: Kernel = import_module(f"{__package__}.{name}").kernel_for(inputs)
     return kernel
 
 
@@ -38,10 +38,10 @@ def _try(backend: str, device: torch.device, dtype: torch.dtype, channels: int) 
     """Render and differentiate one Gaussian."""
     means, cholesky, colors = (torch.full((1, 1, n), 8.0, device=device, dtype=dtype) for n in (2, 3, channels))
     inputs = SplatInputs(means, cholesky, colors, None, None, (16, 16), 1e-4)
-    steps = resolve(backend, inputs)
-    plan = steps.plan(inputs)
-    image = steps.render(plan, inputs)
-    steps.differentiate(plan, inputs, torch.ones_like(image), True)
+    kernel = resolve(backend, inputs)
+    plan = kernel.plan(inputs)
+    image = kernel.render(plan, inputs)
+    kernel.differentiate(plan, inputs, torch.ones_like(image), True)
     return image
 
 

@@ -16,7 +16,7 @@ from torch.nn.functional import pad, threshold
 
 from kcgs.maps import TILE, Coverage
 
-from .interface import Gradients, SplatInputs, Steps, with_autograd
+from .interface import Gradients, Kernel, SplatInputs, with_autograd
 from .tiles import (
     TileGrid,
     bounding_tiles,
@@ -61,9 +61,9 @@ class _Chunk(NamedTuple):
     masks: Tensor  # [T, 1, 256]
 
 
-def steps(inputs: SplatInputs) -> Steps:
+def kernel_for(inputs: SplatInputs) -> Kernel:
     """Return the kernel."""
-    return Steps(_make_plan, _render, _differentiate)
+    return Kernel(_make_plan, _render, _differentiate)
 
 
 def _make_plan(inputs: SplatInputs) -> _Plan:

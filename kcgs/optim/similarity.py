@@ -30,7 +30,7 @@ class Passes:
     def __init__(self, scales: Sequence[Sequence[NDArray[Any]]], factors: Sequence[float], least: float) -> None:
         self._channels = len(scales[0][0])
         sizes = np.array([scale[0].shape[1:] for scale in scales])
-        padded_sizes = sizes + [PADDING, 2 * MARGIN]
+        padded_sizes = sizes + np.array([PADDING, 2 * MARGIN])
         areas = np.column_stack([side.prod(1) for side in (sizes, padded_sizes, (sizes + 1) // 2)])
         table, taps = np.column_stack([sizes, areas.cumsum(0) - areas]), np.array(window_taps(), np.float32)
         sides = (0, 0), (MARGIN, PADDING - MARGIN), (MARGIN, MARGIN)

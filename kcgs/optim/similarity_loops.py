@@ -37,8 +37,7 @@ program = Program("objective of MS-SSIM")
 class Scales(NamedTuple):
     """All scales of an image, flat, finest first.
 
-    Windows lie at even rows and columns. Zeros lie around `padded` planes: 5 rows above and 7 below, 5 columns on either
-    side.
+    Windows lie at even rows and columns. Zeros lie around `padded` planes: 5 rows above and 7 below, 5 columns beside.
     """
 
     table: Any  # [S, 5] int64

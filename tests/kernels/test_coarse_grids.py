@@ -43,7 +43,7 @@ def double(inputs: SplatInputs) -> SplatInputs:
 
 def render(kernel: object, inputs: SplatInputs) -> list[Tensor]:
     """Return the image and the gradients of all three."""
-    steps = kernel.steps(inputs)  # type: ignore[attr-defined]
+    steps = kernel.kernel_for(inputs)  # type: ignore[attr-defined]
     plan = steps.plan(inputs)
     image = steps.render(plan, inputs)
     return [image, *steps.differentiate(plan, inputs, probe(image), True)]

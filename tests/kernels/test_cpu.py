@@ -138,5 +138,5 @@ def test_auto_is_this_kernel(scene: tuple[Tensor, ...]) -> None:
 def test_compiled_once_for_all_channels(scene: tuple[Tensor, ...]) -> None:
     for channels in (1, 5):
         render((*scene[:2], scene[2].repeat(1, 2)[:, :channels], *scene[3:]))
-    for loop in (lists.arrange, lists.measure, lists.list_visits, loops.visit):
+    for loop in (lists.arrange, lists.measure, lists.list_pairs, loops.sum_rows):
         assert len(loop.signatures) == 1

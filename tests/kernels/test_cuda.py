@@ -98,12 +98,12 @@ def inputs(dtype: torch.dtype = torch.float32) -> SplatInputs:
 
 def test_float64() -> None:
     with pytest.raises(ValueError, match="backend 'cuda' computes in float32; got torch.float64: use 'tiled'"):
-        cuda.steps(inputs(torch.float64))
+        cuda.kernel_for(inputs(torch.float64))
 
 
 def test_cpu() -> None:
     with pytest.raises(ValueError, match="backend 'cuda' needs tensors on a CUDA device; got cpu"):
-        cuda.steps(inputs())
+        cuda.kernel_for(inputs())
 
 
 @pytest.mark.parametrize("installed", [False, True])
@@ -119,7 +119,7 @@ def test_missing_triton(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cuda, "_has_triton", lambda: False)
     on_a_gpu = inputs()._replace(means=SimpleNamespace(dtype=torch.float32, device=torch.device("cuda")))
     with pytest.raises(ImportError, match="backend 'cuda' needs Triton: pip install triton"):
-        cuda.steps(on_a_gpu)
+        cuda.kernel_for(on_a_gpu)
 
 
 def test_auto_says_why_it_takes_tiled(monkeypatch: pytest.MonkeyPatch) -> None:

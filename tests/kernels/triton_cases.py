@@ -78,7 +78,7 @@ def probe(inputs: SplatInputs) -> Tensor:
 def evaluate(kernel: ModuleType, inputs: SplatInputs) -> list[Tensor]:
     """Return the image and the gradients."""
     inputs = with_ids(inputs) if kernel is cuda else inputs
-    steps = kernel.steps(inputs)
+    steps = kernel.kernel_for(inputs)
     lists = steps.plan(inputs)
     return [steps.render(lists, inputs), *steps.differentiate(lists, inputs, probe(inputs), True)]
 
@@ -123,10 +123,10 @@ def test_error() -> None:
     inputs = make_inputs(12, regions=2, softness=0.5)
     target = 0.5 * probe(inputs)
     double = to_double(inputs)
-    error = reference.steps(double).render(None, double) - target
-    want = reference.steps(double).differentiate(None, double, error, True)
+    error = reference.kernel_for(double).render(None, double) - target
+    want = reference.kernel_for(double).differentiate(None, double, error, True)
     inputs = with_ids(inputs)
-    steps = cuda.steps(inputs)
+    steps = cuda.kernel_for(inputs)
     assert steps.error_gradients is not None
     assert_close([*steps.error_gradients(steps.plan(inputs), inputs, target)], [*want], 5e-6)
 
@@ -167,7 +167,7 @@ def test_far_weights_are_zero() -> None:
 
 def test_gradient_layouts_and_colours_alone() -> None:
     inputs = make_inputs(size=(9, 16))
-    steps = cuda.steps(inputs)
+    steps = cuda.kernel_for(inputs)
     lists = steps.plan(inputs)
     ones = torch.ones(1, 3, *inputs.size, device=DEVICE)
     gradients = steps.differentiate(lists, inputs, ones, True)

@@ -45,7 +45,7 @@ class Log:
 
 def _interval(state: FitState) -> int:
     """Return the iterations from one measurement to the next."""
-    return max(1, state.problem.config.usual_iterations // _HISTORY_LENGTH)
+    return max(1, state.problem.config.num_iterations // _HISTORY_LENGTH)
 
 
 def measure(state: FitState, scene: Scene, rendered: Tensor, seconds: float) -> None:

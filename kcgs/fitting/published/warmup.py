@@ -26,10 +26,10 @@ class Warmup:
         return math.inf if is_over else state.next_multiple(self._interval(state))
 
     def _last(self, state: FitState) -> float:
-        return self.until * state.problem.config.usual_iterations
+        return self.until * state.problem.config.num_iterations
 
     def _interval(self, state: FitState) -> int:
-        return max(1, round(self.every * state.problem.config.usual_iterations))
+        return max(1, round(self.every * state.problem.config.num_iterations))
 
     def act(self, state: FitState) -> None:
         """Read the ids, but leave no region without its last Gaussian: nothing else would feel the error there."""

@@ -5,6 +5,6 @@
 them read.
 """
 
-from .kernel import steps
+from .kernel import kernel_for
 
-__all__ = ["steps"]
+__all__ = ["kernel_for"]

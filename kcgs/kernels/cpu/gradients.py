@@ -1,4 +1,4 @@
-"""The end of the CPU kernel's backward: from the terms of visits to the gradients of the Gaussians."""
+"""The end of the CPU kernel's backward: from the terms of pairs to the gradients of the Gaussians."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def sum_terms(lists, backward, terms, begin, end):  # type: ignore[no-untyped-de
     Args:
         lists: Lists.
         backward: Backward.
-        terms: (V, ...) float32, as loops.visit fills them.
+        terms: (P, ...) float32, as loops.sum_rows fills them.
         begin: the first Gaussian, in the lists' order.
         end: the last one + 1.
     """

@@ -16,29 +16,31 @@ from kcgs.compiled.tasks import chunks, phases, run_tasks
 from kcgs.maps import Membership
 
 from ..coarse_grids import make_blocks, max_spacing
-from ..interface import Gradients, SplatInputs, Steps
+from ..interface import Gradients, Kernel, SplatInputs
 from ..whitened import least_exponent, support_radius
 from .gradients import Backward
-from .layout import AHEAD, COLUMNS, SHAPE_COLUMNS, TILE_COLS, TILE_ROWS, VISIT_COLUMNS, Batch, Lists, Table
-from .lists import arrange, list_visits, measure
-from .loops import visit
+from .layout import AHEAD, COLUMNS, PAIR_COLUMNS, SHAPE_COLUMNS, TILE_COLS, TILE_ROWS, Batch, Lists, Table
+from .lists import arrange, list_pairs, measure
+from .loops import sum_rows
 from .schedule import ADDS, GATHERS, order_tasks
 from .simd import SIDE
 
 # Gaussians that one task lists, at least, and tasks at most
 _PART = 512
 _MOST_PARTS = 16
-# visits up to which the calling thread does all: waking another costs as much
-_SERIAL_VISITS = 300
+# pairs up to which the calling thread does all: waking another costs as much
+_SERIAL_PAIRS = 300
 
 
-def steps(inputs: SplatInputs) -> Steps:
+def kernel_for(inputs: SplatInputs) -> Kernel:
     """Return the kernel, if it takes these inputs."""
     if inputs.means.dtype != torch.float32:
         raise ValueError(f"backend 'cpu' computes in float32; got {inputs.means.dtype}: use 'tiled' or 'reference'")
     if inputs.means.device.type != "cpu":
         raise ValueError(f"backend 'cpu' needs tensors on the CPU; got {inputs.means.device}")
-    return Steps(plan, render, differentiate, error_gradients=error_gradients, checks_inputs=True)
+    return Kernel(
+        plan, render, differentiate, error_gradients=error_gradients, checks_values=True, takes_one_image=True
+    )
 
 
 def plan(inputs: SplatInputs) -> Lists | None:
@@ -51,10 +53,10 @@ def plan(inputs: SplatInputs) -> Lists | None:
         table, regions = _table_without_map(inputs.size), np.empty(0, np.int64)
     batch = Batch(inputs.colors.shape[:-2].numel(), means, cholesky, colors, regions)
     is_valid, order = arrange(batch, *table.grids[0, TILE_ROWS : TILE_COLS + 1].tolist())
-    return _list_visits(batch, table, order, inputs.cutoff) if is_valid else None
+    return _list_pairs(batch, table, order, inputs.cutoff) if is_valid else None
 
 
-def _list_visits(batch: Batch, table: Table, order: Any, cutoff: float) -> Lists:
+def _list_pairs(batch: Batch, table: Table, order: Any, cutoff: float) -> Lists:
     radius, least = support_radius(cutoff, torch.float32), least_exponent(cutoff, torch.float32)
     count, blocks = len(order), len(table.parents)
     copies = batch.num_images if table.num_maps == 1 else 1
@@ -68,19 +70,19 @@ def _list_visits(batch: Batch, table: Table, order: Any, cutoff: float) -> Lists
     total = int(first_terms[-1])
     lists = Lists(
         order, gaussians, colors, np.empty(copies * blocks + 1, np.int64),
-        np.empty((total + AHEAD, VISIT_COLUMNS), np.int32), np.empty((total, SHAPE_COLUMNS), np.float32), first_terms,
+        np.empty((total + AHEAD, PAIR_COLUMNS), np.int32), np.empty((total, SHAPE_COLUMNS), np.float32), first_terms,
         np.empty(count, np.int32), table,
         np.zeros(copies * (blocks - len(table.mask_rows) + 1), np.bool_), np.float32(math.exp(least)),
     )  # fmt: skip
     histogram, room = np.zeros((parts, copies * blocks), np.int32), np.empty((total, 5), np.int32)
     # the phases of one range follow each other: another thread would only wait
-    run_tasks(partial(list_visits, batch, radius, spans, room, histogram, lists), listing, serial=parts == 1)
+    run_tasks(partial(list_pairs, batch, radius, spans, room, histogram, lists), listing, serial=parts == 1)
     return lists
 
 
 @functools.lru_cache(maxsize=64)
 def _list_tasks(count: int) -> tuple[int, Any, Any]:
-    """Return the number of ranges of so many Gaussians, and the tasks of `measure` and `list_visits`."""
+    """Return the number of ranges of so many Gaussians, and the tasks of `measure` and `list_pairs`."""
     parts = chunks(count, _PART, _MOST_PARTS)
     return len(parts), phases(parts), phases(parts, np.zeros((1, 2), np.int64), parts)
 
@@ -144,7 +146,7 @@ def error_gradients(lists: Lists, inputs: SplatInputs, target: Tensor) -> Gradie
 def _gather(lists: Lists, inputs: SplatInputs, image: Tensor, kind: int) -> tuple[Tensor, Tensor, Tensor]:
     channels = inputs.colors.shape[-1]
     # the loops sum eight terms at a time
-    terms = np.empty((len(lists.visits), -(-(channels + 5) // 8) * 8), np.float32)
+    terms = np.empty((len(lists.pairs), -(-(channels + 5) // 8) * 8), np.float32)
     values = image.resolve_neg().contiguous().numpy().reshape(-1, *image.shape[-3:])
     slopes = _make_nodes(lists, channels)
     nodes = np.zeros_like(slopes) if kind & ADDS else slopes[:0]
@@ -163,5 +165,5 @@ def _make_nodes(lists: Lists, channels: int) -> Any:
 def _visit(lists: Lists, kind: int, backward: Backward, image: Any, nodes: Any, slopes: Any, terms: Any) -> None:
     counts = tuple(lists.table.grids[: None if lists.live.any() else 1, TILE_ROWS].tolist())
     tasks = order_tasks(counts, len(image), kind, len(lists.order))
-    loop = partial(visit, lists, backward, image, nodes, slopes, terms)
-    run_tasks(loop, tasks, serial=len(lists.visits) < _SERIAL_VISITS)
+    loop = partial(sum_rows, lists, backward, image, nodes, slopes, terms)
+    run_tasks(loop, tasks, serial=len(lists.pairs) < _SERIAL_PAIRS)

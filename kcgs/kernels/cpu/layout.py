@@ -32,16 +32,16 @@ TILE_ROWS = 2
 TILE_COLS = 3
 FIRST_TILE = 4  # number of its first tile, through all levels
 
-# columns of Lists.visits
+# columns of Lists.pairs
 GAUSSIAN = 0
 TERMS = 1  # place of its sums
-FIRST = 2  # row of the block to visit
+FIRST = 2  # row of the block
 LAST = 3  # the last one + 1
 RUN = 4  # rows from an exponential to the next
 FIRST_HALF = 5  # of the columns, that the ellipse touches
 END_HALF = 6  # the last one + 1
-VISIT_COLUMNS = 7
-AHEAD = 4  # visits before which a shape is asked for, since those of a block lie far apart
+PAIR_COLUMNS = 7
+AHEAD = 4  # pairs before which a shape is asked for, since those of a block lie far apart
 SHAPE_COLUMNS = 7
 
 
@@ -78,9 +78,9 @@ class Lists(NamedTuple):
     order: Any  # [N] int64, from this order to the caller's
     gaussians: Any  # [N, COLUMNS] float64
     colors: Any  # [N * C] float32, times COLOR_FACTOR
-    start: Any  # [copies * K + 1] int64 into visits; images that share a map have a copy of its blocks each
-    visits: Any  # [V, 7] int32, by block, then by Gaussian
-    shapes: Any  # [V, 7] float32, the Gaussian in the block, see ellipse.enter; in the order of sums
+    start: Any  # [copies * K + 1] int64 into pairs; images that share a map have a copy of its blocks each
+    pairs: Any  # [P, 7] int32, by block, then by Gaussian
+    shapes: Any  # [P, 7] float32, the Gaussian in the block, see ellipse.enter; in the order of sums
     first_terms: Any  # [N + 1] int64, place of each Gaussian's first sums
     num_terms: Any  # [N] int32, blocks that each Gaussian touches
     table: Table

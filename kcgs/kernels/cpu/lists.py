@@ -126,14 +126,14 @@ def measure(batch, table, radius, spacing, order, gaussians, colors, spans, coun
 
 
 @program.entry
-def list_visits(batch, radius, spans, blocks, histogram, lists, tasks, counters):  # type: ignore[no-untyped-def]
-    """Fill start, visits, shapes, num_terms and live of Lists.
+def list_pairs(batch, radius, spans, blocks, histogram, lists, tasks, counters):  # type: ignore[no-untyped-def]
+    """Fill start, pairs, shapes, num_terms and live of Lists.
 
     Args:
         batch: Batch.
         radius: the largest |z| of a weight.
         spans: as `measure` returns them.
-        blocks: (V, 5) int32, room for the block, rows and halves of each visit, by Gaussian.
+        blocks: (P, 5) int32, room for the block, rows and halves of each pair, by Gaussian.
         histogram: (T, copies * K) int32, zeros.
         lists: Lists, of which first_terms has the sums of `counts`.
         tasks: ranges of Gaussians, then the sum over all, then the ranges once more; see `tasks.py`.
@@ -147,7 +147,7 @@ def list_visits(batch, radius, spans, blocks, histogram, lists, tasks, counters)
         elif k == parts:
             _sum_histogram(histogram, lists)
         else:
-            _place_visits(radius, blocks, histogram[k - parts - 1], lists, tasks[k, 1], tasks[k, 2])
+            _place_pairs(radius, blocks, histogram[k - parts - 1], lists, tasks[k, 1], tasks[k, 2])
         k = next_task(tasks, counters)
 
 
@@ -180,7 +180,7 @@ def _find_blocks(batch, radius, spans, blocks, histogram, lists, begin, end):  #
 
 @inner
 def _sum_histogram(histogram, lists):  # type: ignore[no-untyped-def]
-    """Turn numbers of visits into places of the first, set `start`, and mark the blocks of nodes that are not zero."""
+    """Turn numbers of pairs into places of the first, set `start`, and mark the blocks of nodes that are not zero."""
     table, start, live, total = lists.table, lists.start, lists.live, 0
     for head in range(len(start) - 1):
         start[head] = total
@@ -201,15 +201,15 @@ def _sum_histogram(histogram, lists):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _place_visits(radius, blocks, places, lists, begin, end):  # type: ignore[no-untyped-def]
+def _place_pairs(radius, blocks, places, lists, begin, end):  # type: ignore[no-untyped-def]
     for i in range(begin, end):
         first = lists.first_terms[i]
         run = min(max(math.floor((_NORMAL_RADIUS - radius) * lists.gaussians[i, L22]), 1), SIDE)
         for k in range(first, first + lists.num_terms[i]):
-            visit = lists.visits[places[blocks[k, 0]]]
+            pair = lists.pairs[places[blocks[k, 0]]]
             places[blocks[k, 0]] += 1
-            visit[GAUSSIAN], visit[TERMS], visit[FIRST], visit[LAST] = i, k, blocks[k, 1], blocks[k, 2]
-            visit[RUN], visit[FIRST_HALF], visit[END_HALF] = run, blocks[k, 3], blocks[k, 4]
+            pair[GAUSSIAN], pair[TERMS], pair[FIRST], pair[LAST] = i, k, blocks[k, 1], blocks[k, 2]
+            pair[RUN], pair[FIRST_HALF], pair[END_HALF] = run, blocks[k, 3], blocks[k, 4]
 
 
 @inline

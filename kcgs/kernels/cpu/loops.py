@@ -26,8 +26,8 @@ from .spline import add_refined, add_sampled, gather_refined, gather_sampled
 
 
 @program.entry
-def visit(lists, backward, image, nodes, slopes, terms, tasks, counters):  # type: ignore[no-untyped-def]
-    """Visit rows of blocks, and sum up the terms of Gaussians.
+def sum_rows(lists, backward, image, nodes, slopes, terms, tasks, counters):  # type: ignore[no-untyped-def]
+    """Add or gather rows of blocks, and sum up the terms of Gaussians.
 
     Args:
         lists: Lists.
@@ -36,7 +36,7 @@ def visit(lists, backward, image, nodes, slopes, terms, tasks, counters):  # typ
             both, of which the gradient is what they added minus that.
         nodes: float32, the live blocks of all coarse grids, from zero; empty where no Gaussian is wide.
         slopes: float32, gradients of the nodes, from zero.
-        terms: (V, C + 5, rounded up to a multiple of 8) float32, of which each visit's is set: w g of each channel,
+        terms: (P, C + 5, rounded up to a multiple of 8) float32, of which each pair's is set: w g of each channel,
             then v (z1, z2, z1 z1, z1 z2, z2 z2) with z times SCALE, see whitened.sums_to_gradients.
         tasks: see schedule.py.
         counters: see tasks.py.
@@ -59,7 +59,7 @@ def visit(lists, backward, image, nodes, slopes, terms, tasks, counters):  # typ
 @part
 def _visit_row(lists, task, image, pixels, nodes, slopes, terms, sums, offsets, ones):  # type: ignore[no-untyped-def]
     """Visit a row of blocks: add, gather, or both."""
-    table, live, start, visits = lists.table, lists.live, lists.start, lists.visits
+    table, live, start, pairs = lists.table, lists.live, lists.start, lists.pairs
     tile_start, parents, parity = table.tile_start, table.parents, table.parity
     mask_rows, masks, shapes = table.mask_rows, table.masks, lists.shapes.ravel()
     level, b, row = task[LEVEL_FIELD], task[IMAGE], task[ROW]
@@ -81,7 +81,7 @@ def _visit_row(lists, task, image, pixels, nodes, slopes, terms, sums, offsets, 
                 _add_spline(nodes, offsets, parity[block], level, values, origin, channels, weights, first, step)
             for v in range(start[head + block], start[head + block + 1]):
                 add_rows(  # type: ignore[call-arg]
-                    values, origin, channels, visits, v, shapes, lists.colors, lists.cutoff, masks, mask
+                    values, origin, channels, pairs, v, shapes, lists.colors, lists.cutoff, masks, mask
                 )
         if level == 0:
             _exchange(image, pixels, b, row * SIDE, col * SIDE, adds, gathers)
@@ -91,7 +91,7 @@ def _visit_row(lists, task, image, pixels, nodes, slopes, terms, sums, offsets, 
             mask = first if step > 0 else -1
             for v in range(start[head + block], start[head + block + 1]):
                 gather_rows(  # type: ignore[call-arg]
-                    gradients, origin, channels, visits, v, shapes, lists.colors, lists.cutoff, masks, mask, sums,
+                    gradients, origin, channels, pairs, v, shapes, lists.colors, lists.cutoff, masks, mask, sums,
                     terms, terms.shape[1],
                 )  # fmt: skip
             if len(slopes) > 0 and _set_offsets(live, parents, block, base, size, offsets):

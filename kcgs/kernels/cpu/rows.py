@@ -10,7 +10,7 @@ Arguments in common:
 
 - pixels, origin: float32 array, and the first element of the block, [SIDE rows][channel][SIDE columns];
 - channels: their number;
-- visits, number: Lists.visits, and which of them;
+- pairs, number: Lists.pairs, and which of them;
 - shapes, colors, cutoff: see Lists;
 - masks, mask_start: float32 array of membership, and the block's first element, below 0 if there is none.
 """
@@ -26,7 +26,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from .channels import Channels, Sums
-from .layout import AHEAD, END_HALF, FIRST, FIRST_HALF, GAUSSIAN, LAST, RUN, SHAPE_COLUMNS, TERMS, VISIT_COLUMNS
+from .layout import AHEAD, END_HALF, FIRST, FIRST_HALF, GAUSSIAN, LAST, PAIR_COLUMNS, RUN, SHAPE_COLUMNS, TERMS
 from .simd import (
     HALF,
     LONG,
@@ -54,14 +54,14 @@ class _Rows:
     def __init__(self, context: Any, builder: Any, argument_types: Any, arguments: Any) -> None:
         self.builder = builder
         self.channels = arguments[2]
-        pixels, visits, shapes, colors, masks = (
+        pixels, pairs, shapes, colors, masks = (
             pointer(context, builder, argument_types[k], arguments[k], offset)
             for k, offset in ((0, arguments[1]), (3, long(0)), (5, long(0)), (6, long(0)), (8, arguments[9]))
         )
 
         def field(column: int, ahead: int = 0) -> Any:
-            place = builder.mul(builder.add(arguments[4], long(ahead)), long(VISIT_COLUMNS))
-            return builder.sext(builder.load(builder.gep(visits, [builder.add(place, long(column))])), LONG)
+            place = builder.mul(builder.add(arguments[4], long(ahead)), long(PAIR_COLUMNS))
+            return builder.sext(builder.load(builder.gep(pairs, [builder.add(place, long(column))])), LONG)
 
         self.first, self.last, self.run = field(FIRST), field(LAST), field(RUN)
         self.first_half, self.end_half = field(FIRST_HALF), field(END_HALF)
@@ -139,8 +139,8 @@ class _Rows:
 
 
 @intrinsic
-def add_rows(typing_context, pixels, origin, channels, visits, number, shapes, colors, cutoff, masks, mask_start):  # type: ignore[no-untyped-def]
-    """pixels[row, c, :] += weight[row, :] * colors[c] for the rows of a visit."""
+def add_rows(typing_context, pixels, origin, channels, pairs, number, shapes, colors, cutoff, masks, mask_start):  # type: ignore[no-untyped-def]
+    """pixels[row, c, :] += weight[row, :] * colors[c] for the rows of a pair."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         rows = _Rows(context, builder, signature.args, arguments)
@@ -152,15 +152,15 @@ def add_rows(typing_context, pixels, origin, channels, visits, number, shapes, c
         rows.specialize(emit)
         return context.get_dummy_value()
 
-    return types.void(*_types(pixels, visits, shapes, colors, masks)), generate
+    return types.void(*_types(pixels, pairs, shapes, colors, masks)), generate
 
 
 @intrinsic
 def gather_rows(  # type: ignore[no-untyped-def]
-    typing_context, pixels, origin, channels, visits, number, shapes, colors, cutoff, masks, mask_start, sums, terms,
+    typing_context, pixels, origin, channels, pairs, number, shapes, colors, cutoff, masks, mask_start, sums, terms,
     columns,
 ):  # fmt: skip
-    """Set a visit's terms, of so many columns, to sums over its rows: w g_c for every channel c, then, with
+    """Set a pair's terms, of so many columns, to sums over its rows: w g_c for every channel c, then, with
     v = w sum_c g_c colors_c, of v z1, v z2, v z1 z1, v z1 z2, v z2 z2; `sums`, float32, is room for as many vectors."""  # noqa: D205, D209
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -180,11 +180,11 @@ def gather_rows(  # type: ignore[no-untyped-def]
         rows.specialize(emit)
         return context.get_dummy_value()
 
-    kinds = _types(pixels, visits, shapes, colors, masks)
+    kinds = _types(pixels, pairs, shapes, colors, masks)
     return types.void(*kinds, sums, terms, types.int64), generate
 
 
-def _types(pixels: Any, visits: Any, shapes: Any, colors: Any, masks: Any) -> tuple[Any, ...]:
+def _types(pixels: Any, pairs: Any, shapes: Any, colors: Any, masks: Any) -> tuple[Any, ...]:
     """Return the types of the arguments in common."""
     number = types.int64
-    return pixels, number, number, visits, number, shapes, colors, types.float32, masks, number
+    return pixels, number, number, pairs, number, shapes, colors, types.float32, masks, number

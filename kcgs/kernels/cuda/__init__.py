@@ -11,7 +11,7 @@ from importlib.util import find_spec
 
 import torch
 
-from ..interface import SplatInputs, Steps
+from ..interface import Kernel, SplatInputs
 
 
 @functools.cache
@@ -19,7 +19,7 @@ def _has_triton() -> bool:
     return find_spec("triton") is not None
 
 
-def steps(inputs: SplatInputs) -> Steps:
+def kernel_for(inputs: SplatInputs) -> Kernel:
     """Return the kernel, if it takes these inputs."""
     dtype, device = inputs.means.dtype, inputs.means.device
     if dtype != torch.float32:
@@ -28,16 +28,25 @@ def steps(inputs: SplatInputs) -> Steps:
         raise ValueError(f"backend 'cuda' needs tensors on a CUDA device; got {device}")
     if not _has_triton():
         raise ImportError("backend 'cuda' needs Triton: pip install triton")
-    return _steps()
+    return _kernel()
 
 
 @functools.cache
-def _steps() -> Steps:
+def _kernel() -> Kernel:
     from .gather import differentiate, error_gradients
     from .plan import plan
     from .render import render
 
-    return Steps(plan, render, differentiate, None, error_gradients, checks_inputs=True, looks_up_regions=True)
+    return Kernel(
+        plan,
+        render,
+        differentiate,
+        None,
+        error_gradients,
+        checks_values=True,
+        takes_one_image=True,
+        looks_up_regions=True,
+    )
 
 
 def _is_interpreted() -> bool:
