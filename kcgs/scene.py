@@ -133,8 +133,8 @@ class Scene(nn.Module):
         regions = self.regions
         if regions is not None and regions.num_maps is not None:
             shared = regions.num_maps == 1
-            regions = regions.image(0 if shared else index) if isinstance(rows, int) or not shared else regions
-        return Scene(self.field.image(index), regions, self.metadata)
+            regions = regions[0 if shared else index] if isinstance(rows, int) or not shared else regions
+        return Scene(self.field[index], regions, self.metadata)
 
     def __iter__(self) -> Iterator[Scene]:
         return (self[k] for k in range(len(self)))

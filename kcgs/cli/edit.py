@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -52,18 +53,18 @@ def edit(
     from kcgs import editing, load, video
 
     edited = load(scene)
-    editor: Any = editing
-    settings = {"fill": not no_fill}
+    delete_region: Any = partial(editing.delete_region, fill=not no_fill)
+    move_region: Any = partial(editing.move_region, fill=not no_fill)
     if edited.field.means.ndim == 3:
         exclude("a batch of scenes", no_fill=no_fill or None)
         check_output(output, ".safetensors")
-        editor, settings = video, {}
+        delete_region, move_region = video.delete_from_video, video.move_in_video
     if delete:
-        edited = _apply("delete", editor.delete_region, edited, delete, **settings)
+        edited = _apply("delete", delete_region, edited, delete)
     for region, color in colors:
         edited = _apply("recolor", editing.recolor_region, edited, region, color=color)
     for region, offset in offsets:
-        edited = _apply("move", editor.move_region, edited, region, offset, **settings)
+        edited = _apply("move", move_region, edited, region, offset)
     size = edited.save(output)
     print_report({**describe_scene(edited), **describe_file(output, size, edited.size)}, as_json, str(output))
 

@@ -45,7 +45,7 @@ def move_region(scene: Scene, region_ids: int | Iterable[int], offset: Sequence[
 
     Convention: pixels that the regions leave take the label of the nearest pixel of another region. Pixels that leave
     the image are lost. A region that is covered whole, or leaves the image, is lost with its Gaussians. Where the
-    softness differs by pairs of regions, a new contour has their mean. :func:`kcgs.video.move_region` moves regions in
+    softness differs by pairs of regions, a new contour has their mean. :func:`kcgs.video.move_in_video` moves them in
     all frames of a video, and always fills what they leave.
 
     Args:
@@ -159,7 +159,7 @@ def _recolor(scene: Scene, ids: list[int], gain: Numbers, bias: Numbers | None) 
     members = members_of(field, torch.tensor(ids, device=field.means.device))
     channels = field.colors.shape[-1]
     matrix = _color_tensor("gain", gain, field.colors, [(), (channels,), (channels, channels)])
-    result = field.subset(torch.ones_like(members)) if field.means.ndim == 2 else field.image(slice(None))
+    result = field.subset(torch.ones_like(members)) if field.means.ndim == 2 else field[:]
     with torch.no_grad():
         colors = result.colors[members]
         result.colors[members] = colors @ matrix.T if matrix.ndim == 2 else colors * matrix
@@ -238,7 +238,7 @@ def delete_region(scene: Scene, region_ids: int | Iterable[int], *, fill: bool =
 
     Convention: each pixel takes the label of the nearest pixel of another region, and is filled. Arguments and errors
     are those of :func:`move_region`. Where the softness differs by pairs of regions, contours between regions that did
-    not touch before are hard. :func:`kcgs.video.delete_region` deletes regions from all frames of a video, and always
+    not touch before are hard. :func:`kcgs.video.delete_from_video` deletes them from all frames of a video, and always
     fills what they hid, from frames that show it.
 
     Example:

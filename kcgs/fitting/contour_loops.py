@@ -207,8 +207,8 @@ def map_energy_change(before, after, costs, pair_cost, disc):  # type: ignore[no
 def find_small_pieces(labels, edges, stride, smallest):  # type: ignore[no-untyped-def]
     """Return the pixels of 4-connected pieces under `smallest` pixels, and the first pixel of each one's piece.
 
-    The map is flat and has a rim of -1; `edges` are as for `sweep_pixels`. Every piece has a pixel beside another label:
-    from there it is filled, until it is too large.
+    The map is flat and has a rim of -1; `edges` are as for `sweep_pixels`. Every piece has a pixel beside another
+    label: from there it is filled, until it is too large.
     """
     state, queue = np.zeros(len(labels), np.uint8), np.empty(smallest, np.int64)
     pixels, first, end = np.empty(64, np.int64), np.empty(64, np.int64), 0

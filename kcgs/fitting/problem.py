@@ -139,7 +139,7 @@ def regions_of(size: tuple[int, ...], regions: object) -> RegionMap | None:
     if regions is None:
         return None
     if regions.num_maps == 1:
-        regions = regions.image(0)
+        regions = regions[0]
     if regions.size != tuple(size) or regions.num_maps is not None:
         raise InvalidArgument("regions", f"one map of the image's size {tuple(size)}", tuple(regions.labels.shape))
     return regions

@@ -251,7 +251,7 @@ class RegionMap:
         regions._softness, regions._source = self._softness, None
         return regions
 
-    def image(self, index: int | slice) -> RegionMap:
+    def __getitem__(self, index: int | slice) -> RegionMap:
         """Copy one map of a batch, or a slice of it, with the regions that it has.
 
         Raises:
@@ -259,13 +259,13 @@ class RegionMap:
             IndexError: there is no such map.
 
         Example:
-            >>> RegionMap(torch.tensor([[[1, 4]], [[1, 1]]])).image(0).labels
+            >>> RegionMap(torch.tensor([[[1, 4]], [[1, 1]]]))[0].labels
             tensor([[1, 4]])
         """
         if self.num_maps is None:
-            raise ValueError("image needs a batch of maps; got one map")
+            raise ValueError("an index needs a batch of maps; got one map")
         if self._source is not None:
-            return self._source.image(index).resize(self.size)
+            return self._source[index].resize(self.size)
         return self._with_labels(self._labels[index], self.softness)
 
     def _with_labels(self, labels: Tensor, softness: float | Mapping[tuple[int, int], float]) -> RegionMap:

@@ -189,7 +189,7 @@ class GaussianField(nn.Module):
 
         return self._select(mask)
 
-    def image(self, index: int | slice) -> GaussianField:
+    def __getitem__(self, index: int | slice) -> GaussianField:
         """Copy one image of a batch, or a slice of it, into a field of parameters, without the graph.
 
         Raises:
@@ -198,11 +198,11 @@ class GaussianField(nn.Module):
 
         Example:
             >>> means, cholesky, colors = torch.rand(4, 9, 2), torch.ones(4, 9, 3), torch.rand(4, 9, 3)
-            >>> GaussianField(means, cholesky, colors, size=(8, 8)).image(-1).means.shape
+            >>> GaussianField(means, cholesky, colors, size=(8, 8))[-1].means.shape
             torch.Size([9, 2])
         """
         if self.means.ndim == 2:
-            raise ValueError(f"image needs a batched field; got means of shape {tuple(self.means.shape)}")
+            raise ValueError(f"an index needs a batched field; got means of shape {tuple(self.means.shape)}")
         return self._select(index)
 
     @classmethod
@@ -236,8 +236,8 @@ class GaussianField(nn.Module):
         return cls(*tensors, size=fields[0].size)  # type: ignore[arg-type]
 
     def unbind(self) -> list[GaussianField]:
-        """Copy each image of a batch, as :meth:`image` does."""
-        return [self.image(index) for index in range(len(self.means))]
+        """Copy each image of a batch, as an index does."""
+        return [self[index] for index in range(len(self.means))]
 
     def _select(self, index: int | slice | Tensor) -> GaussianField:
         tensors = (self.means, self.cholesky, self.colors, self.region_ids, self.opacities)

@@ -24,7 +24,7 @@ from .stacking import stack
 
 @torch.inference_mode(False)
 @torch.no_grad()
-def delete_region(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
+def delete_from_video(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
     """Delete regions from all frames, and show what is behind them; :func:`kcgs.editing.delete_region` edits one image.
 
     Convention: a hidden pixel takes colour and label from the nearest frame that shows it. Its place there follows from
@@ -48,7 +48,7 @@ def delete_region(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
         ...     labels[t, 4:12, 4 * t : 4 * t + 8] = 7
         >>> field = GaussianField(24 * torch.rand(3, 20, 2), torch.tensor([3.0, 0.0, 3.0]).expand(3, 20, 3),
         ...                       torch.rand(3, 20, 3), size=(16, 24)).assign_regions(labels)
-        >>> delete_region(Scene(field, labels), 7).regions.ids
+        >>> delete_from_video(Scene(field, labels), 7).regions.ids
         tensor([0])
     """
     regions, row_ids, deleted_ids = _check(scenes, region_ids)
@@ -62,7 +62,7 @@ def delete_region(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
         new_regions = regions.relabel(labels, "mean")
         for t, scene in enumerate(scenes):
             means, cholesky, colors = (table.clone() for table in Gaussians.of(scene.field)[:3])
-            ids = torch.where(deleted_rows[t], new_regions.image(t).ids[0], row_ids[t])
+            ids = torch.where(deleted_rows[t], new_regions[t].ids[0], row_ids[t])
             colors[deleted_rows[t]] = 0.0
             if t:  # rows that filled the frame before go on
                 rows, before = deleted_rows[t] & deleted_rows[t - 1], Gaussians.of(frames[-1].field)
@@ -71,7 +71,7 @@ def delete_region(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
                 if before.region_ids is not None:
                     ids[rows] = before.region_ids[rows]
             field = GaussianField(means, cholesky, colors, ids, size=scenes.size)
-            start = Scene(field, new_regions.image(t))
+            start = Scene(field, new_regions[t])
             movable_rows, changed_pixels = torch.ones_like(deleted_rows[t]), torch.ones_like(deleted_pixels[t])
             unused = deleted_rows[t] & (colors == 0).all(-1)
             descent = FrameDescent(images[t], start, config, movable_rows, changed_pixels)
@@ -81,10 +81,10 @@ def delete_region(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
 
 @torch.inference_mode(False)
 @torch.no_grad()
-def move_region(scenes: Scene, region_ids: int | Iterable[int], offset: Sequence[float]) -> Scene:
+def move_in_video(scenes: Scene, region_ids: int | Iterable[int], offset: Sequence[float]) -> Scene:
     """Move regions in all frames, over what lies there; :func:`kcgs.editing.move_region` edits one image.
 
-    Convention: what they leave is filled as :func:`delete_region` does it.
+    Convention: what they leave is filled as :func:`delete_from_video` does it.
 
     Args:
         scenes: T frames with label maps, as :func:`fit_video` gives them.
@@ -95,11 +95,11 @@ def move_region(scenes: Scene, region_ids: int | Iterable[int], offset: Sequence
         New scenes, without a graph. The rows of the regions come last.
 
     Raises:
-        TypeError, ValueError: as :func:`delete_region`; an offset that is not two whole numbers.
+        TypeError, ValueError: as :func:`delete_from_video`; an offset that is not two whole numbers.
     """
     regions, row_ids, ids = _check(scenes, region_ids)
     steps = check_offset(offset)
-    background = delete_region(scenes, region_ids)
+    background = delete_from_video(scenes, region_ids)
     assert background.regions is not None
     is_member, field = torch.isin(row_ids, ids), scenes.field
     rows = is_member.any(0)

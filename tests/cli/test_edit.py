@@ -54,7 +54,7 @@ def test_edits_are_those_of_python_in_a_fixed_order(kcgs: Kcgs, scene: Scene, fi
 
 def test_batch(kcgs: Kcgs, scene: Scene) -> None:
     assert kcgs("edit", "batch.safetensors", *EDITS, "-o", "new.safetensors").code == 0
-    expected = video.move_region(video.delete_region(load("batch.safetensors"), 3), 7, (-3, 1))
+    expected = video.move_in_video(video.delete_from_video(load("batch.safetensors"), 3), 7, (-3, 1))
     assert torch.equal(load("new.safetensors").render(), expected.render())
 
 

@@ -46,7 +46,7 @@ class TestRegionMap(
         regions = RegionMap.from_labels(blobs((45, 69)).to(device).expand(*lead, 45, 69))
         assert regions.size == (45, 69) and regions.labels.shape == (*lead, 45, 69) and regions.ids.shape == (4,)
         assert regions.index.shape == (*(lead or (1,)), 45, 69)
-        assert not lead or regions.image(0).labels.shape == (45, 69)
+        assert not lead or regions[0].labels.shape == (45, 69)
         assert regions.resize((7, 9)).labels.shape == (*lead, 7, 9)
 
     @pytest.mark.parametrize("softness", [0.0, 0.7])
@@ -360,7 +360,7 @@ class TestResize:
         for other in (pickle.loads(pickle.dumps(large)), copy.deepcopy(large), RegionMap.from_state(large.state())):
             assert torch.equal(membership_of(other).coverage.weights, weights)
         expected = membership_of(large).weights(1, 2, torch.float64)
-        torch.testing.assert_close(large.image(1).membership(2), expected, rtol=0, atol=1e-7)
+        torch.testing.assert_close(large[1].membership(2), expected, rtol=0, atol=1e-7)
 
     @pytest.mark.parametrize("size", [(0, 3), (3,), (2.5, 3), "ab", None])
     def test_bad_size(self, size: object) -> None:

@@ -52,7 +52,7 @@ class TestGaussianField(BaseTester):
         assert field.means.dtype == whole(dtype) and field.size == SIZE
         labels = torch.zeros(*lead, *SIZE, device=device, dtype=torch.long)
         assert field.assign_regions(labels).region_ids.shape == (*lead, count)  # type: ignore[union-attr]
-        one = field.image(0) if lead else field
+        one = field[0] if lead else field
         assert one.means.shape == (count, 2) and one.subset(torch.arange(count)).num_gaussians == count
 
     def test_gradcheck(self, device: torch.device, labels: Tensor) -> None:
@@ -158,7 +158,7 @@ class TestGaussianField(BaseTester):
     def test_exception_stack(self, other: list[GaussianField], error: type[Exception], words: str) -> None:
         with pytest.raises(error, match=words):
             GaussianField.stack(other)
-        with pytest.raises(ValueError, match="image needs a batched field"):
+        with pytest.raises(ValueError, match="an index needs a batched field"):
             GaussianField.random(9, SIZE).unbind()
 
     def test_feature(self, field: GaussianField, labels: Tensor) -> None:
@@ -342,7 +342,7 @@ class TestBatch:
         render = RegionSplatRenderer(backend=backend)
         images = render(batch, regions, size)
         images.square().sum().backward()
-        singles = regions if isinstance(regions, Tensor) else [regions.image(k) for k in range(len(maps))]
+        singles = regions if isinstance(regions, Tensor) else [regions[k] for k in range(len(maps))]
         for k, (part, one) in enumerate(zip(parts, singles, strict=True)):
             image = render(part, one, size)
             image.square().sum().backward()

@@ -12,7 +12,7 @@ from kcgs import Scene
 from kcgs.editing import recolor_region
 from kcgs.editing.masks import dilate
 from kcgs.functional import psnr
-from kcgs.video import delete_region, fit_video, interpolate, move_region
+from kcgs.video import delete_from_video, fit_video, interpolate, move_in_video
 
 SIZE = (48, 64)
 SETTINGS: dict[str, Any] = {"num_gaussians": 80, "iterations": 300}
@@ -138,7 +138,7 @@ class TestInterpolate:
 class TestEdits:
     def test_delete(self, scenes: Scene) -> None:
         """What the disc hides is taken from other frames."""
-        edited = delete_region(scenes, 7)
+        edited = delete_from_video(scenes, 7)
         assert edited.regions is not None and edited.regions.ids.tolist() == [0]
         assert edited.num_gaussians == scenes.num_gaussians
         for number, other in ((0, 4), (4, 0)):
@@ -146,7 +146,7 @@ class TestEdits:
             assert (edited[number].render() - GROUND)[:, pixels].square().mean() < 1e-4
 
     def test_move(self, scenes: Scene) -> None:
-        moved = move_region(scenes, 7, (10, 8))
+        moved = move_in_video(scenes, 7, (10, 8))
         assert moved.regions is not None
         labels = moved.regions.labels[2]
         assert torch.equal(labels[8:, 10:] == 7, (scenes.regions.labels[2] == 7)[:-8, :-10])  # type: ignore[union-attr]
@@ -171,10 +171,10 @@ class TestEdits:
     )
     def test_exceptions(self, scenes: Scene, arguments: Any, match: str) -> None:
         with pytest.raises(ValueError, match=match):
-            move_region(scenes, *arguments)
+            move_in_video(scenes, *arguments)
 
     def test_other_scenes(self, scenes: Scene) -> None:
         with pytest.raises(TypeError, match="scenes must be a batch of scenes; got a scene of one image"):
-            delete_region(scenes[0], 7)
+            delete_from_video(scenes[0], 7)
         with pytest.raises(ValueError, match="scenes must have a label map for each frame"):
-            delete_region(Scene(scenes.field), 7)
+            delete_from_video(Scene(scenes.field), 7)
