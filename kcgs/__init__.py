@@ -8,11 +8,12 @@ if TYPE_CHECKING:
     from . import onnx, optim, page, rate, segment, video  # noqa: F401
     from .errors import InvalidArgument, InvalidArgumentType
     from .evaluation import evaluate
+    from .files import load, save
     from .fitting import FitConfig, FitResult, fit
     from .functional import RegionMap
     from .nn import GaussianField, RegionSplatRenderer
     from .pruning import prune
-    from .scene import Scene, load, save
+    from .scene import Scene
 
 __version__ = "0.2.0"
 
@@ -25,11 +26,12 @@ __all__ = [
 _MODULES = {
     "errors": ("InvalidArgument", "InvalidArgumentType"),
     "evaluation": ("evaluate",),
+    "files": ("load", "save"),
     "fitting": ("FitConfig", "FitResult", "fit"),
     "functional": ("RegionMap",),
     "nn": ("GaussianField", "RegionSplatRenderer"),
     "pruning": ("prune",),
-    "scene": ("Scene", "load", "save"),
+    "scene": ("Scene",),
 }
 _PACKAGES = (
     "codec", "data", "editing", "engine", "fitting", "functional", "nn", "onnx", "optim", "page", "rate", "segment",

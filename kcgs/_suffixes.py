@@ -1,7 +1,6 @@
 """Suffixes of files, for rooms that load torch and for the command line, which checks names before it does."""
 
-SCENE_FORMATS = {".safetensors": "kcgs.storage", ".kcgs": "kcgs.codec.scenes"}
-"""Formats of scenes: a module, imported on use, with ``serialize(scene)`` and ``deserialize(data)``."""
+SCENES = (".safetensors", ".kcgs")
 
 WRITTEN_IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 """Images that `save_image` writes."""

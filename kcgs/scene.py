@@ -1,10 +1,9 @@
-"""Scene: Gaussians and the label map to render them with, in memory and on disk."""
+"""Scene: Gaussians and the label map to render them with."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,16 +11,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+import kcgs
 from kcgs._atomic import atomic_path
 from kcgs._check import check_size
 from kcgs._memory import check_memory
 from kcgs._repr import png, shorten
-from kcgs._suffixes import SCENE_FORMATS
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap
 from kcgs.maps import as_region_map
-from kcgs.nn import GaussianField, RegionSplatRenderer
-from kcgs.nn.renderer import rendered_size
+from kcgs.nn import GaussianField, RegionSplatRenderer, rendered_size
 
 if TYPE_CHECKING:
     import onnx
@@ -141,7 +139,7 @@ class Scene(nn.Module):
 
     def save(self, path: str | os.PathLike[str]) -> int:
         """Write the scene, as :func:`kcgs.save` does; return the bytes of the file."""
-        return save(path, self)
+        return kcgs.save(path, self)
 
     def to_onnx(self, path: str | os.PathLike[str], **options: Any) -> onnx.ModelProto:
         """Write the ONNX graph that renders the scene at any size, as Kornia's modules do, and return it.
@@ -165,7 +163,7 @@ class Scene(nn.Module):
         path = Path(path)
         if path.suffix != ".onnx":
             raise ValueError(f"path must end in .onnx; got {str(path)!r}")
-        model: onnx.ModelProto = import_module("kcgs.onnx").scene_decoder(self, **options)
+        model: onnx.ModelProto = kcgs.onnx.scene_decoder(self, **options)
         with atomic_path(path) as temporary:
             temporary.write_bytes(model.SerializeToString())
         return model
@@ -201,82 +199,6 @@ class Scene(nn.Module):
         if self.regions is not None:
             self.regions = self.regions.to(self.field.means.device)
         return self
-
-
-def save(path: str | os.PathLike[str], scene: Scene) -> int:
-    """Write a scene. The file appears whole or not at all, and the same scene gives the same bytes.
-
-    Args:
-        path: ends in .safetensors, which keeps every bit, or in .kcgs, which rounds as
-            :func:`kcgs.codec.encode` does by default and keeps no metadata; its folder must exist.
-        scene: N Gaussians, or (.safetensors only) a batch of them.
-
-    Returns:
-        Size of the file in bytes.
-
-    Raises:
-        TypeError: no scene.
-        ValueError: another suffix, values that are not finite, l11 or l22 not positive, sizes above 2**20, a batch
-            of label maps that does not fit the field.
-        FileNotFoundError: the folder does not exist.
-
-    Example:
-        >>> import tempfile
-        >>> scene = Scene(GaussianField.random(10, (32, 48), seed=0), metadata={"title": "ten blobs"})
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     size = save(f"{folder}/scene.safetensors", scene)
-        ...     loaded = load(f"{folder}/scene.safetensors")
-        >>> torch.equal(loaded.field.colors, scene.field.colors), loaded.regions, loaded.metadata
-        (True, None, {'title': 'ten blobs'})
-    """
-    path = Path(path)
-    file_format = _format(path)
-    content: bytes = file_format.serialize(check_type(scene))
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(content)
-    return len(content)
-
-
-def load(path: str | os.PathLike[str]) -> Scene:
-    """Read a scene.
-
-    Args:
-        path: a .safetensors file that :func:`save` wrote, or a whole .kcgs file; the beginning of one is read by
-            :func:`kcgs.codec.decode`.
-
-    Returns:
-        The scene, on the CPU; from .safetensors bit for bit as saved. Region ids and labels are int64.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: another suffix; the file is damaged, no scene, or of another format version; the message names
-            the path.
-
-    Example:
-        >>> import tempfile
-        >>> field = GaussianField.random(10, (32, 48), seed=0)
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     path = f"{folder}/scene.safetensors"
-        ...     _ = save(path, Scene(field, torch.zeros(32, 48).long()))
-        ...     scene = load(path)
-        >>> scene.size, scene.regions.num_regions, scene.metadata
-        ((32, 48), 1, {})
-    """
-    path = Path(path)
-    if not path.exists():
-        raise FileNotFoundError(f"no such file: {path}")
-    deserialize: Callable[[bytes], Scene] = _format(path).deserialize
-    data = path.read_bytes()
-    try:
-        return deserialize(data)
-    except ValueError as error:
-        raise ValueError(f"cannot load {path}: {error}") from error
-
-
-def _format(path: Path) -> Any:
-    if path.suffix not in SCENE_FORMATS:
-        raise ValueError(f"path must end in {' or '.join(SCENE_FORMATS)}; got {str(path)!r}")
-    return import_module(SCENE_FORMATS[path.suffix])
 
 
 def empty_regions(scene: Scene) -> Tensor:

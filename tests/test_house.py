@@ -22,21 +22,23 @@ LAYERS = [
     {"zoo"},
     {"page"},
     {"rate", "video"},
-    {"editing"},
+    {"editing", "files"},
     {"fitting", "codec", "onnx", "segment"},
     {"data", "evaluation", "pruning", "storage"},
     {"scene"},
     {"optim"},
     {"nn"},
     {"functional"},
-    {"kernels", "engine", "plots"},
+    {"kernels"},
     {"maps"},
-    {"compiled"},
+    {"compiled", "engine", "plots"},
     {"_labels"},
     {"_image"},
-    {"_atomic", "_check", "_decode", "_memory", "_progress", "_repr", "_suffixes", "_warn"},
+    {"_atomic", "_check", "_decode", "_memory", "_progress", "_repr", "_sizes", "_suffixes", "_warn"},
     {"errors", "_rows"},
 ]
+# modules beside the `__init__` of a room that other rooms import, two of a room at most: they load numba or Triton
+DOORS = {"kcgs.compiled.program", "kcgs.compiled.tasks", "kcgs.kernels.cuda.program"}
 # what to say: what not to
 REPLACED = {
     "image, render": r"\bpictures?\b|\bdraw(s|n|ing|ings)?\b",
@@ -107,6 +109,31 @@ def test_no_circle_of_imports() -> None:
         for module in leaves:
             del edges[module]
     assert not edges, f"circles among {sorted(edges)}"
+
+
+def test_rooms_are_entered_through_their_doors() -> None:
+    """Other rooms import a name that the `__init__` of a room imports, which imports no name in vain."""
+    rooms = [module for module, path in MODULES.items() if module.count(".") == 1 and path.name == "__init__.py"]
+    doors = {room: {entry.name for entry in imports_of(room) if entry.name} for room in rooms}
+    used = {room: set(import_module(room).__all__) for room in rooms if hasattr(import_module(room), "__all__")}
+    for module in MODULES:
+        for target, name in imports_of(module):
+            room = ".".join(target.split(".")[:2])
+            if room not in doors or f"{module}.".startswith(f"{room}.") or target in DOORS:
+                continue
+            path = f"{target}.{name}" if name else target
+            if path != room:
+                member = path.removeprefix(f"{room}.")
+                assert member in doors[room], f"{module} imports {path}"
+                used[room].add(member)
+    assert not {room: names - used[room] for room, names in doors.items() if names - used.get(room, names)}
+
+
+def test_no_room_is_imported_by_a_string() -> None:
+    """Only `kcgs/__init__.py` does; others import modules of their own folder so."""
+    for module, path in MODULES.items():
+        for argument in re.findall(r"(?:import_module|__import__)\((.+?)[,)]", path.read_text()):
+            assert module == "kcgs" or re.match(r'f"{__(name|package)__}\.', argument), f"{module}: {argument}"
 
 
 def test_private_names_stay_in_their_package() -> None:

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from kcgs._atomic import check_writable
-from kcgs._suffixes import LABEL_MAPS, SCENE_FORMATS
+from kcgs._suffixes import LABEL_MAPS, SCENES
 from kcgs.errors import InvalidArgument
 
 # exit status of a program that Ctrl-C ended
@@ -37,8 +37,8 @@ def _scene_path(text: str, other_suffixes: tuple[str, ...] = ()) -> Path:
         except ValueError as error:
             raise typer.BadParameter(str(error)) from error
     path = Path(text)
-    if path.suffix not in SCENE_FORMATS and path.suffix.lower() not in other_suffixes:
-        suffixes = " or ".join((*SCENE_FORMATS, *other_suffixes))
+    if path.suffix not in SCENES and path.suffix.lower() not in other_suffixes:
+        suffixes = " or ".join((*SCENES, *other_suffixes))
         raise typer.BadParameter(f"must end in {suffixes}, or be zoo:NAME; got {text!r}")
     return path
 

@@ -32,7 +32,7 @@ def export(
 
     loaded = load(scene)
     if output.suffix == ".html":
-        from kcgs.page.html import scene_page, web_bytes
+        from kcgs.page import scene_page, web_bytes
 
         exclude("a page", interactive=interactive or None)
         # a compressed file goes into the page as it is
@@ -53,8 +53,7 @@ def view(
 ) -> None:
     """Look at a scene in the browser: zoom, hide regions. Ends with Ctrl-C."""
     from kcgs import load
-    from kcgs.page import scene_page
-    from kcgs.page.server import serve
+    from kcgs.page import scene_page, serve
     from kcgs.scene import check_unbatched
 
     loaded = check_unbatched(load(scene))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kcgs._suffixes import SCENE_FORMATS
+from kcgs._suffixes import SCENES
 from kcgs.errors import InvalidArgument
 
 from .commands import app
@@ -43,7 +43,7 @@ def edit(
 
     Of a batch of scenes, all frames are edited. A .kcgs file has the quality that `encode` has by default.
     """
-    check_output(output, *SCENE_FORMATS)
+    check_output(output, *SCENES)
     if not (delete or recolor or move):
         raise typer.BadParameter("an edit needs --delete, --recolor or --move")
     colors = [_parse("recolor", "ID=COLOR, such as 2=#ff0000", text) for text in recolor or []]

@@ -13,7 +13,7 @@ import typer
 
 from kcgs._atomic import write_file
 from kcgs._progress import Progress
-from kcgs._suffixes import SCENE_FORMATS
+from kcgs._suffixes import SCENES
 from kcgs.errors import InvalidArgument
 
 from . import options
@@ -55,7 +55,7 @@ def fit_command(
     scene's, which the fit may have moved. The seconds are those of the fit and of the writing of its file.
     """
     output = output or Path(f"{image.stem}{request.default_suffix}")
-    check_output(output, *(SCENE_FORMATS if request.target_bytes is None else (".kcgs",)))
+    check_output(output, *(SCENES if request.target_bytes is None else (".kcgs",)))
     check_new(output, overwrite)
     from kcgs.data import load_image
 

@@ -11,7 +11,7 @@ import typer
 
 from kcgs._atomic import write_file
 from kcgs._progress import Progress
-from kcgs._suffixes import SCENE_FORMATS, VIDEOS, WRITTEN_IMAGES
+from kcgs._suffixes import SCENES, VIDEOS, WRITTEN_IMAGES
 
 from .commands import app
 from .common import (
@@ -160,7 +160,7 @@ def encode(
 ) -> None:
     """Compress a scene, or a label map without loss."""
     check_output(output, ".kcgs")
-    if scene.suffix not in SCENE_FORMATS:
+    if scene.suffix not in SCENES:
         exclude("a label map", target_bytes=target_bytes, quality=quality, image=image, objective=objective)
         from kcgs.codec import encode_labels
         from kcgs.data import load_labels
@@ -225,8 +225,7 @@ def decode(
 
 def _read_map(file: Path) -> Tensor | None:
     """Return the label map of a compressed file that holds one."""
-    from kcgs.codec import decode_labels
-    from kcgs.codec.file import MAP_MAGIC
+    from kcgs.codec import MAP_MAGIC, decode_labels
 
     data = file.read_bytes()
     return decode_labels(data) if data.startswith(MAP_MAGIC) else None

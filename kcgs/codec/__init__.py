@@ -1,7 +1,11 @@
 """The compressed file `.kcgs`, of a scene or of a label map; docs/format.md specifies it."""
 
+from .file import MAP_MAGIC
+from .gaussians.quantize import OPPONENT, QPS, Classes, Codes, Parameters, Quantizer
 from .label_files import decode_labels, encode_labels
 from .rangecoder import CodecError
-from .scenes import Decoded, decode, encode
+from .region_map import encode_region_map
+from .scenes import QUALITIES, Decoded, SceneWriter, decode, encode
 
+# public; what else is imported here is for the other rooms of kcgs
 __all__ = ["CodecError", "Decoded", "decode", "decode_labels", "encode", "encode_labels"]

@@ -14,7 +14,6 @@ from kcgs.maps import MAX_SOFTNESS, compact, touching_pairs, wrap_labels
 from .adaptive import AdaptiveSymbol
 from .exact import Integers
 from .file import MAX_LABELS, MAX_REGIONS, ByteReader, varint
-from .labels.stream import decode_ids, decode_numbers, encode_stream, label_pixels
 from .rangecoder import CodecError, Coder, Reader, Writer
 
 _UNITS = 40  # of softness, per pixel
@@ -24,6 +23,8 @@ _GROUP = 32  # pairs that are coded before their model learns
 
 def encode_region_map(regions: RegionMap) -> bytes:
     """Write a map of two regions or more; softness is rounded to fortieths of a pixel."""
+    from .labels.stream import encode_stream  # loads numba
+
     if regions.is_resampled:
         raise ValueError("regions must be a map of its own pixels; got one that was resized")
     check_count("number of labels", regions.labels.numel(), 1, MAX_LABELS)
@@ -50,6 +51,8 @@ def _round(softness: float) -> int:
 
 def decode_region_map(data: bytes, size: tuple[int, int], num_regions: int) -> RegionMap:
     """Read a map of `num_regions` regions for an image of `size`."""
+    from .labels.stream import decode_ids, decode_numbers, label_pixels  # loads numba
+
     reader = ByteReader(data)
     stream = reader.take(reader.varint("length of the labels", 1, len(data)))
     pixels, ids = decode_ids(stream, size, num_regions, is_file=False)

@@ -14,8 +14,7 @@ import torch
 from kcgs._check import check_count, check_floating, check_number
 from kcgs._repr import brief
 from kcgs.errors import InvalidArgument
-from kcgs.functional import RegionMap
-from kcgs.functional.covariance import check_cholesky
+from kcgs.functional import RegionMap, check_cholesky
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene, check_scene
 
@@ -23,7 +22,8 @@ from .exact import Integers
 from .file import MAX_CHANNELS, MAX_SIDE, Header, max_gaussians, pack, unpack
 from .gaussians.layers import LayerCoder
 from .gaussians.quantize import QP_PER_OCTAVE, QPS, Classes, Codes, Parameters, Quantizer
-from .rangecoder import CodecError, Reader, Writer
+from .rangecoder import Reader, Writer
+from .region_map import decode_region_map, encode_region_map
 
 # PSNR in dB of the decoded render against the scene's own
 QUALITIES = (10.0, 90.0)  # least and largest
@@ -72,11 +72,6 @@ def encode(scene: Scene, *, quality: float | None = None, target_bytes: int | No
     return writer.largest_file(writer.write_rounded, target_bytes)[1]
 
 
-def serialize(scene: Scene) -> bytes:
-    """Write a scene at the default quality, for :func:`kcgs.save`."""
-    return encode(scene)
-
-
 class SceneWriter:
     """Writes files of a scene at any quantization parameter; its map is coded once."""
 
@@ -92,8 +87,6 @@ class SceneWriter:
         self.ids = np.zeros(field.num_gaussians, np.int64)  # as positions among the map's ids
         self.region_map = b""
         if self.regions is not None:
-            from .region_map import encode_region_map  # loads numba
-
             assert field.region_ids is not None
             ids = field.region_ids.cpu()
             self.ids = self.regions.index_of(ids).numpy()
@@ -243,8 +236,6 @@ def decode(data: bytes, *, max_bytes: int | None = None) -> Decoded:
     header, region_map, layers = unpack(bytes(data[:max_bytes]))
     regions = None
     if header.regions > 1:
-        from .region_map import decode_region_map  # loads numba
-
         regions = decode_region_map(region_map, header.size, header.regions)
     coder = LayerCoder(Quantizer(header.qp, header.size), header.channels, regions)
     parts, ids, remaining = [], [], max_gaussians(header.channels)
@@ -258,13 +249,3 @@ def decode(data: bytes, *, max_bytes: int | None = None) -> Decoded:
     region_ids = None if regions is None else regions.ids[torch.from_numpy(np.concatenate(ids))]
     field = GaussianField(means, cholesky, colors, region_ids, size=header.size)
     return Decoded(Scene(field, regions), len(layers), len(header.layers))
-
-
-def deserialize(data: bytes) -> Scene:
-    """Read a whole file, for :func:`kcgs.load`."""
-    decoded = decode(data)
-    if decoded.layers < decoded.num_layers:
-        raise CodecError(
-            f"it ends early, with {decoded.layers} of {decoded.num_layers} layers; kcgs decode renders what is there"
-        )
-    return decoded.scene

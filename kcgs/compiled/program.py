@@ -167,14 +167,28 @@ def _find_sources(file: Path) -> set[Path]:
 
 @functools.cache
 def _find_imports(file: Path) -> list[Path]:
-    """Return the files of the modules of kcgs that a file imports from."""
-    modules = []
+    """Return the files that hold what a file imports from kcgs; names that a package re-exports are in one of its."""
+    return [source for module, names in _read_imports(file) for name in names for source in _find_origin(module, name)]
+
+
+@functools.cache
+def _read_imports(file: Path) -> list[tuple[Path, list[str]]]:
+    """Return the modules of kcgs that a file imports from, without a suffix, and names from each."""
+    imports = []
     for start, name, members in _IMPORT.findall(file.read_text(encoding="utf-8")):
         folder = file.parents[len(start) - 1] if start.startswith(".") else _PACKAGE
-        module = folder.joinpath(*name.split("."))
-        modules += [module, *(module / member for member in re.findall(r"\w+", members) if module.is_dir())]
-    sources = (source for module in modules for source in (Path(f"{module}.py"), module / "__init__.py"))
-    return [source for source in sources if source.is_file()]
+        imports.append((folder.joinpath(*name.split(".")), re.findall(r"\w+", members)))
+    return imports
+
+
+def _find_origin(module: Path, name: str) -> list[Path]:
+    """Return the file that has a name of a module of kcgs, if there is such a module."""
+    if not module.is_dir():
+        return [source] if (source := Path(f"{module}.py")).is_file() else []
+    for origin, names in _read_imports(module / "__init__.py"):
+        if name in names:
+            return _find_origin(origin, name)
+    return _find_origin(module / name, name) or [module / "__init__.py"]
 
 
 @functools.cache

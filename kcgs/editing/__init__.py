@@ -1,8 +1,12 @@
 """Edit scenes by region: new scenes, and images of regions alone or over another image."""
 
+from .inpainting import inpaint
+from .masks import check_offset, dilate, nearest_labels, shift_labels
 from .render import render_over, render_region
 from .scenes import delete_region, extract_region, move_region, recolor_region, replace_background
+from .selection import members_of, unique_region_ids
 
+# public; what else is imported here is for the other rooms of kcgs
 __all__ = [
     "delete_region",
     "extract_region",

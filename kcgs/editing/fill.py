@@ -8,13 +8,18 @@ from torch.nn.functional import pad
 
 from kcgs.compiled import threads_for_kernels
 from kcgs.functional import RegionMap, region_splat
-from kcgs.nn import GaussianField
-from kcgs.nn.field import join
-from kcgs.optim import GaussianAdam
-from kcgs.optim.descent import FieldDescent
-from kcgs.optim.gaussians import Canvas, Gaussians
-from kcgs.optim.objectives import SquaredError
-from kcgs.optim.run import End, cosine_decay, count_iterations, run
+from kcgs.nn import GaussianField, join
+from kcgs.optim import (
+    Canvas,
+    End,
+    FieldDescent,
+    GaussianAdam,
+    Gaussians,
+    SquaredError,
+    cosine_decay,
+    count_iterations,
+    run,
+)
 from kcgs.scene import Scene
 
 from .inpainting import inpaint_from_matches

@@ -9,9 +9,7 @@ from torch import Tensor
 
 from kcgs._check import check_image, check_size
 from kcgs.functional import region_splat
-from kcgs.nn import GaussianField, RegionSplatRenderer
-from kcgs.nn.field import scaled_gaussians
-from kcgs.nn.renderer import area_mean, rendered_size
+from kcgs.nn import GaussianField, RegionSplatRenderer, area_mean, rendered_size, scaled_gaussians
 from kcgs.scene import Scene
 
 from .selection import select_regions

@@ -16,8 +16,7 @@ from kcgs._image import LUMA
 from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap
-from kcgs.nn import GaussianField
-from kcgs.nn.field import join, scaled_gaussians
+from kcgs.nn import GaussianField, join, scaled_gaussians
 from kcgs.scene import Scene, check_scene, check_type
 
 from .fill import fill_hole

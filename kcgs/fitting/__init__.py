@@ -1,13 +1,16 @@
 """An image in, a scene out."""
 
-from .config import FitConfig, available_recipes
+from .config import FitConfig, ObjectiveName, available_recipes
+from .contour_moves import move_contours
 from .initial import initial_field
-from .loop import fit, precompile
-from .pursuit import propose_gaussians
-from .region_report import RegionReport
-from .removal import Removal, lowest_impact
+from .loop import fit, fit_problem, precompile
+from .problem import Problem, check_image_and_regions, make_problem
+from .pursuit import propose_for, propose_gaussians
+from .region_report import RegionReport, report_regions
+from .removal import Removal, least_impact, lowest_impact
 from .result import FitResult, HistoryEntry
 
+# public; what else is imported here is for the other rooms of kcgs
 __all__ = [
     "FitConfig", "FitResult", "HistoryEntry", "RegionReport", "Removal", "available_recipes", "fit", "initial_field",
     "lowest_impact", "precompile", "propose_gaussians",

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcgs.optim.descent import FieldDescent
+from kcgs.optim import FieldDescent
 
 
 class CapturedStep:

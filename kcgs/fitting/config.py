@@ -17,7 +17,7 @@ from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.kernels import BACKENDS
 from kcgs.maps import MAX_SOFTNESS
 from kcgs.nn import GaussianField
-from kcgs.optim.run import Event
+from kcgs.optim import Event
 
 ObjectiveName = Literal["auto", "psnr", "ms-ssim"]
 _USUAL_ITERATIONS = 700

@@ -9,8 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs.functional import RegionMap, region_splat
-from kcgs.functional.blur import blur, gaussian_taps
+from kcgs.functional import RegionMap, blur, gaussian_taps, region_splat
 from kcgs.scene import Scene
 
 from .contour_loops import (

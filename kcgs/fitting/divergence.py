@@ -10,6 +10,7 @@ from torch import Tensor
 
 from kcgs._warn import warn_user
 from kcgs.nn import GaussianField
+from kcgs.optim import is_within
 
 from .readback import Readback
 from .state import FitState
@@ -61,10 +62,7 @@ def is_finite(field: GaussianField) -> bool:
     tables = field.means, field.cholesky, field.colors
     if not field.means.is_cpu:
         return bool((_magnitudes(tables) < _LARGEST).all())
-    from kcgs.optim.loops import is_within  # loads numba
-
-    # compiled: between renders, whose data fill the caches, an operation of torch takes thirty microseconds
-    return all(is_within(table.detach().numpy().ravel(), _LARGEST) for table in tables)
+    return all(is_within(table, _LARGEST) for table in tables)
 
 
 @torch.no_grad()

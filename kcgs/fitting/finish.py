@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from kcgs.kernels import settle
-from kcgs.optim.gaussians import Gaussians
+from kcgs.optim import Gaussians
 from kcgs.pruning import prune
 
 from .divergence import is_finite

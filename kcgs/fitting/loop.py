@@ -14,7 +14,7 @@ from kcgs._warn import warn_user
 from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
 from kcgs.kernels import prepare
-from kcgs.optim.run import End, Event, run
+from kcgs.optim import End, Event, run
 
 from .clock import Clock
 from .config import FitConfig

@@ -6,9 +6,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from kcgs.nn import GaussianField
-from kcgs.optim import GaussianAdam
-from kcgs.optim.gaussian_adam import COLOR_LEARNING_RATE, LEARNING_RATE
-from kcgs.optim.run import cosine_decay
+from kcgs.optim import COLOR_LEARNING_RATE, LEARNING_RATE, GaussianAdam, cosine_decay
 
 from .config import FitConfig
 from .published.gaussian_image import GaussianImageAdan

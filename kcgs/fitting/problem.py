@@ -14,8 +14,7 @@ from kcgs._image import as_image
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap, edge_band
 from kcgs.maps import as_region_map
-from kcgs.optim.ms_ssim import MsSsim
-from kcgs.optim.objectives import AbsoluteError, LossObjective, Objective, SquaredError
+from kcgs.optim import AbsoluteError, LossObjective, MsSsim, Objective, SquaredError
 
 from .config import FitConfig
 from .published.ssim_loss import AbsoluteAndSsim

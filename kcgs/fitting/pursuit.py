@@ -16,9 +16,7 @@ from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap, lookup_regions, region_splat
 from kcgs.kernels import check_backend, takes_triton
 from kcgs.nn import GaussianField
-from kcgs.optim.gaussians import Canvas
-from kcgs.optim.ms_ssim import halve
-from kcgs.optim.objectives import Objective
+from kcgs.optim import Canvas, Objective, halve
 
 from .problem import regions_of
 

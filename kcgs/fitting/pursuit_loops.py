@@ -12,7 +12,7 @@ from torch import Tensor
 
 from kcgs.compiled.program import Program, inner
 from kcgs.compiled.tasks import first_task, next_task, ranges, run_tasks
-from kcgs.functional.blur import gaussian_taps
+from kcgs.functional import gaussian_taps
 
 program = Program("search for new Gaussians")
 

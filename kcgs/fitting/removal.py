@@ -13,7 +13,7 @@ from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.functional import RegionMap
 from kcgs.kernels import check_backend
 from kcgs.nn import GaussianField
-from kcgs.optim.gaussians import Canvas, Gaussians, draft_cutoff
+from kcgs.optim import Canvas, Gaussians, draft_cutoff
 
 from .problem import regions_of
 from .state import FitState

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from kcgs.optim.run import Event
+from kcgs.optim import Event
 
 from .config import FitConfig
 from .events import AdaptContours, Densify, EndDrafts, SettleContours

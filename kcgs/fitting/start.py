@@ -8,9 +8,9 @@ from typing import Any
 from torch import Tensor
 
 from kcgs.functional import RegionMap, choose_softness
-from kcgs.functional.merging import pairs_to_merge
+from kcgs.maps import pairs_to_merge
 from kcgs.nn import GaussianField
-from kcgs.optim.gaussians import Canvas, draft_cutoff
+from kcgs.optim import Canvas, draft_cutoff
 
 from .config import FitConfig
 from .initial import initial_sigma, random_field, uniform_field

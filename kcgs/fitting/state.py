@@ -12,8 +12,7 @@ import torch
 
 from kcgs.functional import RegionMap
 from kcgs.kernels import settle, without_waiting
-from kcgs.optim import GaussianAdam
-from kcgs.optim.descent import FieldDescent
+from kcgs.optim import FieldDescent, GaussianAdam
 from kcgs.scene import Scene
 
 from .captured import CapturedStep

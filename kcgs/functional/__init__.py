@@ -3,17 +3,33 @@
 from kcgs.maps import PairSoftness, RegionMap, edge_band, lookup_regions
 
 from .activation import activate_gaussians
+from .blur import blur, gaussian_taps
 from .contour_fit import choose_softness
 from .covariance import (
+    check_cholesky,
     cholesky_to_covariance,
     cholesky_to_scale_rotation,
     covariance_to_cholesky,
     scale_rotation_to_cholesky,
 )
 from .merging import merge_regions
-from .metrics import ef_psnr, ef_ssim, ms_ssim, psnr, ssim
-from .splat import region_splat
+from .metrics import (
+    K1,
+    K2,
+    SCALE_WEIGHTS,
+    SSIM_SIGMA,
+    SSIM_WINDOW,
+    ef_psnr,
+    ef_ssim,
+    ms_ssim,
+    psnr,
+    ssim,
+    window_mean,
+    window_taps,
+)
+from .splat import region_splat, splat_at, squared_error_gradients
 
+# public; what else is imported here is for the other rooms of kcgs
 __all__ = [
     "PairSoftness", "RegionMap", "activate_gaussians", "cholesky_to_covariance", "cholesky_to_scale_rotation",
     "choose_softness", "covariance_to_cholesky", "edge_band", "ef_psnr", "ef_ssim", "lookup_regions", "merge_regions",

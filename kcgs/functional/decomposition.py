@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from kcgs.kernels.whitened import least_exponent, support_radius
+from kcgs.kernels import least_exponent, support_radius
 
 from .arguments import SplatArguments
 from .map_windows import MapWindows

@@ -11,9 +11,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from kcgs._sizes import is_equal
 from kcgs.maps import LEAST_BLUR, RADIUS_SIGMAS, MapOperands, antialias, sharpness
-
-from .sizes import is_equal
 
 _TINY = 1e-30  # less than any sum of a blur
 _LARGEST_EXPONENT = 64  # of memberships: float32 holds the powers

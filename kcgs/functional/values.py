@@ -7,7 +7,7 @@ from torch import Tensor
 
 from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument
-from kcgs.kernels.whitened import MEAN_LIMIT, SCALE_LIMITS
+from kcgs.kernels import MEAN_LIMIT, SCALE_LIMITS
 
 _OUT_OF_RANGE = (
     "Where an optimizer's step made them so, take a smaller learning rate, or kcgs.optim.GaussianAdam, which keeps a "

@@ -11,19 +11,16 @@ All take the inputs of `interface`, and share `whitened` coordinates.
 `tiled` and `cuda` share `tiles`; `cpu` evaluates wide Gaussians on `coarse_grids`.
 """
 
+from .coarse_grids import Blocks, Coarsened, choose_levels, coarsen, make_blocks, max_spacing
 from .cuda.capacity import settle, without_waiting
 from .interface import Kernel, SplatInputs, with_autograd
 from .registry import BACKENDS, check_backend, prepare, resolve, takes_triton
+from .tiles import bounding_tiles, find_keys
+from .whitened import MEAN_LIMIT, SCALE_LIMITS, Z_LIMIT, least_exponent, support_radius
 
 __all__ = [
-    "BACKENDS",
-    "Kernel",
-    "SplatInputs",
-    "check_backend",
-    "prepare",
-    "resolve",
-    "settle",
-    "takes_triton",
-    "with_autograd",
+    "BACKENDS", "MEAN_LIMIT", "SCALE_LIMITS", "Z_LIMIT", "Blocks", "Coarsened", "Kernel", "SplatInputs",
+    "bounding_tiles", "check_backend", "choose_levels", "coarsen", "find_keys", "least_exponent", "make_blocks",
+    "max_spacing", "prepare", "resolve", "settle", "support_radius", "takes_triton", "with_autograd",
     "without_waiting",
 ]  # fmt: skip

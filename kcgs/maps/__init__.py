@@ -16,15 +16,17 @@ from .labels import (
 )
 from .membership import Membership
 from .operands import MapOperands, membership_at
+from .region_graph import Labels, RegionGraph, merge_nearest, pairs_to_merge
 from .regions import RegionMap, wrap_labels
 from .resampled import LEAST_BLUR, PIXEL, Resampled, SmoothMembership, cut_windows, find_windows, sharpness
 from .softness import MAX_SOFTNESS, PairSoftness
 from .widths import RADIUS_SIGMAS, ContourWidths, find_widths
 
 __all__ = [
-    "LEAST_BLUR", "MAX_SOFTNESS", "PIXEL", "RADIUS_SIGMAS", "TILE", "ContourWidths", "Coverage", "MapOperands",
-    "Membership", "PairSoftness", "RegionMap", "Resampled", "SmoothMembership", "antialias", "as_region_map", "compact",
-    "contour_edges", "cut_windows", "edge_band", "find_widths", "find_windows", "interior_points", "lookup_regions",
-    "make_coverage", "map_operands", "membership_at", "pixels_under", "positions_of", "sharpness", "shifted",
+    "LEAST_BLUR", "MAX_SOFTNESS", "PIXEL", "RADIUS_SIGMAS", "TILE", "ContourWidths", "Coverage", "Labels",
+    "MapOperands", "Membership", "PairSoftness", "RegionGraph", "RegionMap", "Resampled", "SmoothMembership",
+    "antialias", "as_region_map", "compact", "contour_edges", "cut_windows", "edge_band", "find_widths", "find_windows",
+    "interior_points", "lookup_regions", "make_coverage", "map_operands", "membership_at", "merge_nearest",
+    "pairs_to_merge", "pixels_under", "positions_of", "sharpness", "shifted",
     "touching_pairs", "unique_pairs", "wrap_labels",
 ]  # fmt: skip

@@ -1,6 +1,7 @@
 """Modules: a set of Gaussians, and the renderer that renders it."""
 
-from .field import GaussianField
-from .renderer import RegionSplatRenderer
+from .field import GaussianField, join, scaled_gaussians
+from .renderer import RegionSplatRenderer, area_mean, rendered_size
 
+# public; what else is imported here is for the other rooms of kcgs
 __all__ = ["GaussianField", "RegionSplatRenderer"]

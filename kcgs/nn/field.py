@@ -19,11 +19,10 @@ from kcgs._check import (
     check_tensor,
 )
 from kcgs._labels import check_labels
+from kcgs._sizes import is_equal
 from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument, InvalidArgumentType
-from kcgs.functional import RegionMap, lookup_regions
-from kcgs.functional.covariance import check_cholesky
-from kcgs.functional.sizes import is_equal
+from kcgs.functional import RegionMap, check_cholesky, lookup_regions
 
 _HALF = (torch.float16, torch.bfloat16)
 

@@ -8,9 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from kcgs._check import check_cutoff, check_size
-from kcgs.functional import RegionMap
-from kcgs.functional.sizes import is_equal
-from kcgs.functional.splat import splat_at
+from kcgs._sizes import is_equal
+from kcgs.functional import RegionMap, splat_at
 from kcgs.maps import map_operands
 
 from .field import GaussianField, scaled_gaussians

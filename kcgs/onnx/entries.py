@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kcgs.kernels.whitened import Z_LIMIT
+from kcgs.kernels import Z_LIMIT
 from kcgs.maps import TILE
 
 from .graph import FLOAT, Graph, Value

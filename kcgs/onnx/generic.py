@@ -9,7 +9,7 @@ import onnx
 import torch
 
 from kcgs._check import check_cutoff
-from kcgs.kernels.whitened import support_radius
+from kcgs.kernels import support_radius
 
 from .graph import BOOL, FLOAT, INT64, Graph, Value
 from .metadata import decoder_metadata, image_doc

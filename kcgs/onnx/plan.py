@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs.functional import RegionMap
-from kcgs.kernels.coarse_grids import Blocks, Coarsened, make_blocks
+from kcgs.kernels import Blocks, Coarsened, make_blocks
 from kcgs.maps import TILE
 from kcgs.nn import GaussianField
 

@@ -5,9 +5,16 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kcgs.kernels.coarse_grids import Blocks, Coarsened, choose_levels, coarsen, max_spacing
-from kcgs.kernels.tiles import bounding_tiles, find_keys
-from kcgs.kernels.whitened import support_radius
+from kcgs.kernels import (
+    Blocks,
+    Coarsened,
+    bounding_tiles,
+    choose_levels,
+    coarsen,
+    find_keys,
+    max_spacing,
+    support_radius,
+)
 from kcgs.maps import TILE
 
 # pairs of a Gaussian and a block whose distances are computed at once: 8 MB for each float64 of a pair

@@ -8,8 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcgs.functional import RegionMap, region_splat
-from kcgs.functional.splat import squared_error_gradients
+from kcgs.functional import RegionMap, region_splat, squared_error_gradients
 from kcgs.nn import GaussianField
 
 # Cutoff of descents whose result is rendered with a smaller one: it saves a third of the weights of 1e-4.

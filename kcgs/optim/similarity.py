@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcgs.compiled.tasks import phases, run_tasks
-from kcgs.functional.metrics import window_taps
+from kcgs.functional import window_taps
 
 from .similarity_loops import CHANNEL, HALVE, HEIGHT, MARGIN, PADDING, SCALE, SCORE, SUM, WIDTH, Scales, run_phases
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from kcgs.compiled.program import Program, inner
 from kcgs.compiled.tasks import first_task, next_task
-from kcgs.functional.metrics import K1, K2
+from kcgs.functional import K1, K2
 
 # half the window of SSIM, in pixels
 MARGIN = 5

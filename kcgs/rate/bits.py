@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from kcgs.codec.gaussians.quantize import OPPONENT, Quantizer
+from kcgs.codec import OPPONENT, Quantizer
 
 # pixels: a Gaussian whose standard deviations have a smaller product costs as many bits as one of this product; sums
 # over pixel centres are nothing like integrals there

@@ -14,20 +14,13 @@ from torch import Tensor
 from kcgs._check import check_count
 from kcgs._progress import Progress
 from kcgs._repr import brief
-from kcgs.codec import decode
-from kcgs.codec.scenes import SceneWriter
+from kcgs.codec import SceneWriter, decode, encode_region_map
 from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
-from kcgs.fitting import FitConfig, FitResult, HistoryEntry
-from kcgs.fitting.loop import fit_problem
-from kcgs.fitting.problem import Problem, make_problem
-from kcgs.fitting.region_report import report_regions
+from kcgs.fitting import FitConfig, FitResult, HistoryEntry, Problem, fit_problem, make_problem, report_regions
 from kcgs.functional import RegionMap, edge_band, merge_regions
-from kcgs.functional.merging import pairs_to_merge
-from kcgs.maps import contour_edges
-from kcgs.nn import GaussianField
-from kcgs.nn.field import scaled_gaussians
-from kcgs.nn.renderer import area_mean
+from kcgs.maps import contour_edges, pairs_to_merge
+from kcgs.nn import GaussianField, area_mean, scaled_gaussians
 from kcgs.scene import Scene
 
 from .compress import Compressor
@@ -308,11 +301,7 @@ def _choose_regions(problem: Problem, target_bytes: int) -> _RegionChoice:
 
 def _map_bytes(regions: RegionMap) -> int:
     """Return the bytes that the label map takes in a file."""
-    if regions.num_regions == 1:
-        return 0
-    from kcgs.codec.region_map import encode_region_map  # loads numba
-
-    return len(encode_region_map(regions))
+    return 0 if regions.num_regions == 1 else len(encode_region_map(regions))
 
 
 def _fit_share(

@@ -12,16 +12,12 @@ import torch
 from kcgs._check import check_count, check_number
 from kcgs._image import as_image
 from kcgs._repr import brief
-from kcgs.codec import decode
-from kcgs.codec.gaussians.quantize import QPS, Quantizer
-from kcgs.codec.scenes import QUALITIES, SceneWriter
+from kcgs.codec import QPS, QUALITIES, Quantizer, SceneWriter, decode
 from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
-from kcgs.fitting.config import ObjectiveName
+from kcgs.fitting import ObjectiveName
 from kcgs.functional import psnr
-from kcgs.optim.ms_ssim import MsSsim
-from kcgs.optim.objectives import Objective, SquaredError
-from kcgs.optim.run import At, End, count_iterations, run
+from kcgs.optim import At, End, MsSsim, Objective, SquaredError, count_iterations, run
 from kcgs.scene import Scene
 
 from .descent import RATE, RateDistortionDescent

@@ -9,11 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs.codec.gaussians.quantize import Parameters, Quantizer
-from kcgs.codec.scenes import SceneWriter
-from kcgs.optim.gaussians import Canvas, Gaussians
-from kcgs.optim.newton import NewtonDescent, area
-from kcgs.optim.objectives import Objective
+from kcgs.codec import Parameters, Quantizer, SceneWriter
+from kcgs.optim import Canvas, Gaussians, NewtonDescent, Objective, area
 
 from .bits import soft_bits
 

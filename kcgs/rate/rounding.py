@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import torch
 
-from kcgs.codec.gaussians.quantize import Classes, Codes
-from kcgs.optim.run import At, End, count_iterations, run
+from kcgs.codec import Classes, Codes
+from kcgs.optim import At, End, count_iterations, run
 
 from .descent import RATE, RateDistortionDescent
 

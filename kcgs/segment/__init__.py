@@ -1,6 +1,6 @@
 """Where label maps come from."""
 
-from kcgs.segment import methods  # noqa: F401  registers all methods
+from kcgs.segment import methods  # registers all methods
 from kcgs.segment.cleanup import Cleanup, Prediction, Segmentation
 from kcgs.segment.registry import available_methods, method_options, register, segment, segment_with_scores
 

@@ -15,8 +15,7 @@ from kcgs._check import check_count
 from kcgs._labels import check_labels
 from kcgs._repr import brief
 from kcgs.compiled import threads_for_kernels
-from kcgs.functional.merging import Labels, RegionGraph, merge_nearest
-from kcgs.maps import compact
+from kcgs.maps import Labels, RegionGraph, compact, merge_nearest
 from kcgs.segment.images import check_segment_image, lab_sums, rgb_to_lab
 from kcgs.segment.snapping import snap_contours
 

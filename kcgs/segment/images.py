@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs._image import as_image
-from kcgs.functional.merging import Labels
+from kcgs.maps import Labels
 
 # by which values may pass [0, 1], as they do after resizing or colour conversion
 _TOLERANCE = 1e-3

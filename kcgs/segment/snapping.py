@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from kcgs.functional.merging import Labels, RegionGraph
+from kcgs.maps import Labels, RegionGraph
 from kcgs.segment.images import lab_sums
 
 # share of the pixels of a region that lie further inside than `reach`, below which the region is a ribbon

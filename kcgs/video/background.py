@@ -7,8 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcgs.editing.inpainting import inpaint
-from kcgs.editing.masks import dilate, nearest_labels
+from kcgs.editing import dilate, inpaint, nearest_labels
 
 from .flow import sample
 

@@ -8,16 +8,22 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from kcgs.fitting import FitConfig
-from kcgs.fitting.contour_moves import move_contours
-from kcgs.fitting.pursuit import propose_for
-from kcgs.fitting.removal import least_impact
+from kcgs.fitting import FitConfig, least_impact, move_contours, propose_for
 from kcgs.functional import RegionMap
-from kcgs.optim.gaussians import Canvas, Gaussians, draft_cutoff
-from kcgs.optim.ms_ssim import MsSsim
-from kcgs.optim.newton import NewtonDescent, area
-from kcgs.optim.objectives import SquaredError
-from kcgs.optim.run import At, End, Event, count_iterations, run
+from kcgs.optim import (
+    At,
+    Canvas,
+    End,
+    Event,
+    Gaussians,
+    MsSsim,
+    NewtonDescent,
+    SquaredError,
+    area,
+    count_iterations,
+    draft_cutoff,
+    run,
+)
 from kcgs.scene import Scene
 
 # Numbers are tuned: more iterations and relocations lower the error, and take longer and flicker more.

@@ -8,13 +8,11 @@ import torch
 from torch import Tensor
 
 from kcgs.compiled import threads_for_kernels
-from kcgs.editing.masks import check_offset, shift_labels
-from kcgs.editing.selection import unique_region_ids
+from kcgs.editing import check_offset, shift_labels, unique_region_ids
 from kcgs.fitting import FitConfig
 from kcgs.functional import RegionMap
-from kcgs.nn import GaussianField
-from kcgs.nn.field import join
-from kcgs.optim.gaussians import Gaussians
+from kcgs.nn import GaussianField, join
+from kcgs.optim import Gaussians
 from kcgs.scene import Scene, check_batch
 
 from .background import affine_motions, apply_affine, restore_background

@@ -17,8 +17,7 @@ from kcgs._atomic import atomic_path
 from kcgs._check import check_number
 from kcgs._image import as_image
 from kcgs._suffixes import LABEL_MAPS, WRITTEN_IMAGES
-from kcgs.data.images import load_image, save_image
-from kcgs.data.labels import load_labels
+from kcgs.data import load_image, load_labels, save_image
 
 # frames per second where a file or an iterable does not have a rate
 DEFAULT_FRAME_RATE = 24.0

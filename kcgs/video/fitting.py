@@ -17,11 +17,10 @@ from kcgs._check import check_count
 from kcgs._progress import Progress
 from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
-from kcgs.fitting import FitConfig, fit
-from kcgs.fitting.problem import check_image_and_regions
+from kcgs.fitting import FitConfig, check_image_and_regions, fit
 from kcgs.functional import RegionMap, lookup_regions
 from kcgs.nn import GaussianField
-from kcgs.optim.gaussians import Gaussians
+from kcgs.optim import Gaussians
 from kcgs.scene import Scene
 
 from .descent import FrameDescent, canvas_of

@@ -7,9 +7,8 @@ import math
 import torch
 
 from kcgs._check import check_number
-from kcgs.editing.selection import members_of
-from kcgs.nn import GaussianField
-from kcgs.nn.field import join
+from kcgs.editing import members_of
+from kcgs.nn import GaussianField, join
 from kcgs.scene import Scene, check_batch
 
 from .flow import move_labels, move_points, optical_flow, sample

@@ -8,7 +8,7 @@ import torch
 
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
-from kcgs.optim.gaussians import Gaussians
+from kcgs.optim import Gaussians
 from kcgs.scene import Scene
 
 

@@ -167,12 +167,14 @@ def global_names(code: CodeType) -> set[str]:
 
 
 def find_origins(module: str) -> dict[str, str]:
-    """Return the modules that a module imports names from."""
+    """Return the modules that a module imports names from; where a room of kcgs does so, too, those."""
     origins: dict[str, str] = {}
     for node in ast.walk(ast.parse(inspect.getsource(sys.modules[module]))):
         if isinstance(node, ast.ImportFrom):
             source = resolve_name("." * node.level + (node.module or ""), sys.modules[module].__package__)
-            origins |= {alias.asname or alias.name: source for alias in node.names}
+            is_door = source.startswith("kcgs.") and hasattr(sys.modules[source], "__path__")
+            inner = find_origins(source) if is_door else {}
+            origins |= {alias.asname or alias.name: inner.get(alias.name, source) for alias in node.names}
     return origins
 
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from kcgs.functional import ssim
-from kcgs.optim.objectives import AbsoluteError
+from kcgs.optim import AbsoluteError
 
 # of 1 - SSIM beside the mean absolute error
 _SSIM_WEIGHT = 0.1

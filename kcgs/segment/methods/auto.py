@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcgs.compiled import image_threads_for_kernels
 from kcgs.functional import merge_regions
-from kcgs.functional.merging import Labels
+from kcgs.maps import Labels
 from kcgs.segment.cleanup import Cleanup, clean, merge_similar, to_regions
 from kcgs.segment.images import lab_sums, reduce_image, rgb_to_lab
 from kcgs.segment.registry import register
