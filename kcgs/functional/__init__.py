@@ -12,6 +12,7 @@ from .covariance import (
     covariance_to_cholesky,
     scale_rotation_to_cholesky,
 )
+from .evaluation import squared_error_gradients
 from .merging import merge_regions
 from .metrics import (
     K1,
@@ -27,7 +28,7 @@ from .metrics import (
     window_mean,
     window_taps,
 )
-from .splat import region_splat, splat_at, squared_error_gradients
+from .splat import region_splat, splat_at
 
 # public; what else is imported here is for the other rooms of kcgs
 __all__ = [

@@ -8,6 +8,9 @@ from torch import Tensor
 
 from kcgs.maps import MapOperands
 
+# operands where one region covers everything
+NO_MAP = (None,) * (len(MapOperands._fields) - 1)
+
 
 class SplatArguments(NamedTuple):
     """The arguments of the operator, in order; floating tensors share one dtype, float32 or float64.

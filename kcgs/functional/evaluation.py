@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from kcgs.kernels import Kernel, SplatInputs, resolve, with_autograd
-from kcgs.maps import membership_at, positions_of
+from kcgs.maps import RegionMap, map_operands, membership_at, positions_of
 
-from .arguments import SplatArguments
+from .arguments import NO_MAP, SplatArguments
 from .values import check_region_ids, check_values
 
 
@@ -55,14 +55,30 @@ def differentiate(arguments: SplatArguments, plan: Plan, grad: Tensor, geometry:
     return means.squeeze(0), cholesky.squeeze(0), colors.squeeze(0)
 
 
-def error_gradients(arguments: SplatArguments, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the gradients of half the squared error, summed over the pixels, against an image of the same shape."""
+def squared_error_gradients(
+    image: Tensor,
+    means: Tensor,
+    cholesky: Tensor,
+    colors: Tensor,
+    region_ids: Tensor | None,
+    regions: RegionMap | None,
+    *,
+    cutoff: float,
+    backend: str,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the gradients of half the squared error of a render, summed over the pixels of an image (C, H, W).
+
+    For descents: one pass over the image where the backend has it, no graph, and shapes are not checked.
+    """
+    operands = NO_MAP if regions is None else map_operands(regions)[:-1]
+    gaussians = means.detach(), cholesky.detach(), colors.detach()
+    arguments = SplatArguments._make((*gaussians, region_ids, *operands, *image.shape[1:], cutoff, backend))
     plan = plan_splat(arguments)
     if plan.kernel.error_gradients is None:
-        return differentiate(arguments, plan, render(arguments, plan) - target, True)
-    means, cholesky, colors = plan.kernel.error_gradients(plan.content, plan.inputs, target)
-    assert means is not None and cholesky is not None
-    return means, cholesky, colors
+        return differentiate(arguments, plan, render(arguments, plan) - image, True)
+    of_means, of_cholesky, of_colors = plan.kernel.error_gradients(plan.content, plan.inputs, image)
+    assert of_means is not None and of_cholesky is not None
+    return of_means, of_cholesky, of_colors
 
 
 def differentiate_twice(

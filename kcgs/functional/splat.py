@@ -9,16 +9,13 @@ from kcgs._check import check_cutoff, check_floating, check_ids, check_rows, che
 from kcgs.kernels import check_backend
 from kcgs.maps import MapOperands, RegionMap, map_operands
 
-from .arguments import SplatArguments
+from .arguments import NO_MAP
 from .decomposition import decompose
-from .evaluation import error_gradients
 from .operator import splat_operator
 from .torch_internals import register_decomposition
 
 # for torch.onnx.export alone: compilers and torch.export keep the operator
 register_decomposition(splat_operator, decompose)
-
-_NO_MAP = (None,) * (len(MapOperands._fields) - 1)
 
 
 def region_splat(
@@ -103,7 +100,7 @@ def splat_at(
 ) -> Tensor:
     """Render at a size, at which the map is sampled, as by :meth:`RegionMap.resize`; ids and map come together."""
     _check_gaussians(means, cholesky, colors)
-    tensors: tuple[Tensor | None, ...] = _NO_MAP
+    tensors: tuple[Tensor | None, ...] = NO_MAP
     if regions is not None:
         region_ids = check_ids("region_ids", region_ids, means, values=False)
         _check_map(regions.labels, means)
@@ -114,28 +111,6 @@ def splat_at(
         *gaussians, region_ids, *tensors, *size, check_cutoff(cutoff), check_backend(backend)
     )
     return image if colors.dtype == dtype else image.to(colors.dtype)
-
-
-def squared_error_gradients(
-    image: Tensor,
-    means: Tensor,
-    cholesky: Tensor,
-    colors: Tensor,
-    region_ids: Tensor | None,
-    regions: RegionMap | None,
-    *,
-    cutoff: float,
-    backend: str,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the gradients of half the squared error of a render, summed over the pixels of an image (C, H, W).
-
-    For descents: one pass over the image where the backend has it, no graph, and arguments are not checked.
-    """
-    height, width = image.shape[1:]
-    tensors = _NO_MAP if regions is None else map_operands(regions)[:-1]
-    gaussians = means.detach(), cholesky.detach(), colors.detach()
-    arguments = *gaussians, region_ids, *tensors, height, width, cutoff, backend
-    return error_gradients(SplatArguments._make(arguments), image)
 
 
 def _check_gaussians(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:

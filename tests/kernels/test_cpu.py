@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from kcgs import RegionMap
-from kcgs.functional import region_splat
-from kcgs.functional.splat import squared_error_gradients
+from kcgs.functional import region_splat, squared_error_gradients
 from kcgs.kernels.cpu import lists, loops
 from kcgs.kernels.cpu.simd import EXP2
 
