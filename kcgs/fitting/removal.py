@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
@@ -19,18 +17,9 @@ from .problem import regions_of
 from .state import FitState
 
 
-class Removal(NamedTuple):
-    """Gaussians to remove."""
-
-    mask: Tensor
-    """Those to remove, boolean (N)."""
-    colors: Tensor
-    """Colours of all, (N, C), with which the others stand in for them."""
-
-
 def lowest_impact(
     field: GaussianField, num_gaussians: int, regions: RegionMap | Tensor | None = None, *, backend: str = "auto"
-) -> Removal:
+) -> tuple[Tensor, Tensor]:
     r"""Find the Gaussians that cost least to remove, for :meth:`kcgs.optim.GaussianAdam.keep`.
 
     Convention: the impact of Gaussian i is :math:`|c_i|^2 \langle g_i, g_i \rangle / (1 + \sum_j o_{ij})`. The overlap
@@ -46,7 +35,8 @@ def lowest_impact(
         backend: as in :func:`kcgs.functional.region_splat`.
 
     Returns:
-        A mask of those to remove, and the colours of all.
+        A mask of those to remove, boolean :math:`(N)`, and the colours of all, :math:`(N, C)`, with which the others stand
+        in for them.
 
     Raises:
         TypeError: no field, or a number that is not whole.
@@ -73,7 +63,7 @@ def lowest_impact(
 
 
 @torch.no_grad()
-def least_impact(canvas: Canvas, gaussians: Gaussians, count: int, weight: Tensor) -> Removal:
+def least_impact(canvas: Canvas, gaussians: Gaussians, count: int, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Do what `lowest_impact` does, by a weight of the squared error of each Gaussian, (N,)."""
     _, cholesky, colors, _ = gaussians
 
@@ -94,7 +84,7 @@ def least_impact(canvas: Canvas, gaussians: Gaussians, count: int, weight: Tenso
     # inner products of the step's render, with what is removed and with itself
     tiny = torch.finfo(step.dtype).tiny
     length = (step * removed_products).sum() / (step * products(cholesky, step)).sum().clamp_min(tiny)
-    return Removal(removed, colors + length * step)
+    return removed, colors + length * step
 
 
 @torch.no_grad()
