@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+
 import torch
 from torch import Tensor
 
@@ -35,8 +36,8 @@ def lowest_impact(
         backend: as in :func:`kcgs.functional.region_splat`.
 
     Returns:
-        A mask of those to remove, boolean :math:`(N)`, and the colours of all, :math:`(N, C)`, with which the others stand
-        in for them.
+        A mask of those to remove, boolean :math:`(N)`, and the colours of all, :math:`(N, C)`: the others stand in for
+        them.
 
     Raises:
         TypeError: no field, or a number that is not whole.
