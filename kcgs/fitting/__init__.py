@@ -7,7 +7,7 @@ from .loop import fit, fit_problem, precompile
 from .problem import Problem, check_image_and_regions, make_problem
 from .pursuit import propose_for, propose_gaussians
 from .region_report import RegionReport, report_regions
-from .removal import least_impact, lowest_impact
+from .removal import lowest_impact, lowest_weighted_impact
 from .result import FitResult, HistoryEntry
 
 # public; what else is imported here is for the other rooms of kcgs

@@ -26,7 +26,7 @@ _USUAL_ITERATIONS = 700
 class FitConfig(BaseModel):
     """Settings of a fit; the defaults are the recipe `best`.
 
-    Convention: moments of a fit are fractions of its iterations, so that 500 and 50,000 both make sense. What a
+    Convention: moments of a fit are fractions of its iterations, so that 500 and 50,000 both make sense. What an
     event or an optimizer needs beyond these are fields of its class.
 
     Raises:

@@ -53,7 +53,7 @@ def _has_diverged(state: FitState) -> bool:
         return False
     numbers, columns = previous.numbers(), sum(table.shape[1] for table in tables)
     if any(map(math.isnan, numbers[columns:])):
-        state.waits = True
+        state.lacks_room = True
     return not all(number < _LARGEST for number in numbers[:columns])
 
 

@@ -10,7 +10,7 @@ from kcgs.pruning import prune
 
 from .divergence import is_finite
 from .events import EndDrafts
-from .events.log import measure, take_up
+from .events.log import collect_measurements, measure
 from .region_report import report_regions
 from .removal import remove_gaussians
 from .result import FitResult, StopReason
@@ -20,7 +20,7 @@ from .state import FitState
 def finish(state: FitState, reason: StopReason, seconds: float) -> FitResult:
     """Measure the last scene, take the best, and prune it; return a fit that ended for a reason."""
     problem, config = state.problem, state.problem.config
-    take_up(state, wait=True)
+    collect_measurements(state, wait=True)
     settle(problem.image.device, problem.size)
     best_draft = state.best if state.is_draft else None
     EndDrafts().act(state)
@@ -31,7 +31,7 @@ def finish(state: FitState, reason: StopReason, seconds: float) -> FitResult:
         if reason != "diverged" and is_finite(state.field):
             remove_gaussians(state, state.num_gaussians - problem.num_gaussians)
             measure(state, state.scene, state.render(), seconds)
-    take_up(state, wait=True)
+    collect_measurements(state, wait=True)
     assert state.best is not None
     scene, num_pruned, prune_error = state.best, 0, 0.0
     if config.prune > 0:

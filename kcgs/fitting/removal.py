@@ -60,11 +60,11 @@ def lowest_impact(
         raise InvalidArgument("regions", "given where the field has region ids, and only there", regions)
     count = check_count("num_gaussians", num_gaussians, 0, field.num_gaussians)
     gaussians, canvas = Gaussians.of(field), Canvas(field.size, map_of_field, backend=check_backend(backend))
-    return least_impact(canvas, gaussians, count, torch.ones_like(gaussians.means[:, 0]))
+    return lowest_weighted_impact(canvas, gaussians, count, torch.ones_like(gaussians.means[:, 0]))
 
 
 @torch.no_grad()
-def least_impact(canvas: Canvas, gaussians: Gaussians, count: int, weight: Tensor) -> tuple[Tensor, Tensor]:
+def lowest_weighted_impact(canvas: Canvas, gaussians: Gaussians, count: int, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Do what `lowest_impact` does, by a weight of the squared error of each Gaussian, (N,)."""
     _, cholesky, colors, _ = gaussians
 
@@ -95,6 +95,6 @@ def remove_gaussians(state: FitState, count: int) -> None:
         return
     gaussians, cutoff = Gaussians.of(state.field), draft_cutoff(state.problem.config.cutoff)
     canvas, weight = state.canvas._replace(cutoff=cutoff), state.objective.weigh(gaussians)
-    removed, colors = least_impact(canvas, gaussians, count, weight)
+    removed, colors = lowest_weighted_impact(canvas, gaussians, count, weight)
     state.field.colors.data.copy_(colors)
     state.optimizer.keep(state.field, ~removed)

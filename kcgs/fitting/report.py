@@ -8,7 +8,7 @@ from kcgs._progress import Progress
 
 from .clock import Clock
 from .events.checkpoint import Checkpoint
-from .events.log import take_up
+from .events.log import collect_measurements
 from .result import HistoryEntry
 from .state import FitState
 
@@ -31,7 +31,7 @@ class Report:
         """Take up what was measured, and tell of it."""
         if state.iteration == self.first:
             return None
-        take_up(state, wait=False)
+        collect_measurements(state, wait=False)
         entry = state.history[-1]
         self.bar.update(
             state.progress, f"iteration {state.iteration}, {entry.num_gaussians} Gaussians, {entry.psnr:.2f} dB"

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
+from operator import is_not
 from typing import NamedTuple
 
 import torch
@@ -53,8 +54,8 @@ class FitState(FieldDescent):
     """Measurements whose errors are not in the history yet."""
     magnitudes: Readback | None = None
     """The largest absolute numbers of the field and its gradients some iterations ago, where the host runs ahead."""
-    waits: bool = True
-    """The next step waits for the device, to learn how much room the Gaussians take."""
+    lacks_room: bool = False
+    """A step on a device had no room for its lists."""
     best: Scene | None = None
     """A copy of the best scene that was measured."""
     best_value: float = math.inf
@@ -63,6 +64,7 @@ class FitState(FieldDescent):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._first, self._captured = self.iteration, CapturedStep()
+        self._stepped: list[object] = []  # what the last step moved, and by what
 
     @property
     def scene(self) -> Scene:
@@ -100,6 +102,15 @@ class FitState(FieldDescent):
         return -(-self.iteration // interval) * interval / self.problem.config.max_iterations
 
     @property
+    def waits(self) -> bool:
+        """True where the next step waits for the device, to learn how much room the Gaussians take, after an event."""
+        content = self._content()
+        return self.lacks_room or len(content) != len(self._stepped) or any(map(is_not, content, self._stepped))
+
+    def _content(self) -> list[object]:
+        return [self.field.means, self.field.cholesky, self.field.colors, self.field.region_ids, self.canvas]
+
+    @property
     def is_settled(self) -> bool:
         """True where a render need not wait for the device."""
         return self.runs_ahead and not self.waits and self.iteration >= self._first + _CHECKED_ITERATIONS
@@ -107,25 +118,25 @@ class FitState(FieldDescent):
     @property
     def replays(self) -> bool:
         """True where the next step is a kernel's programs alone, on a GPU, which a CUDA graph replays."""
-        return self.is_settled and self.field.means.is_cuda and self.objective.takes_one_pass(self.canvas)
+        return self.is_settled and self.field.means.is_cuda and self.objective.has_fused_gradients(self.canvas)
 
     @contextmanager
-    def room(self) -> Iterator[None]:
+    def running_ahead(self) -> Iterator[None]:
         """Render without waiting for the device, where that is possible, and without a graph that no step needs."""
         with without_waiting() if self.is_settled else nullcontext(), torch.set_grad_enabled(not self.replays):
             yield
 
     def step(self, rate: float) -> None:
         """Move the field once."""
-        if self.waits:
+        if self.runs_ahead and self.waits:
             settle(self.problem.image.device, self.problem.size)
             self._captured.forget()
         super().step(rate)
-        self.waits = False
+        self._stepped, self.lacks_room = self._content(), False
 
     def move(self) -> None:
         """Take a step, or replay one."""
-        with self.room():
+        with self.running_ahead():
             if self.replays:
                 self.rendered = None
                 self._captured(self)

@@ -67,7 +67,7 @@ class NewtonDescent:
 
     def color_curvature(self) -> Tensor:
         """Return half the second derivative of the objective by a colour, (N,)."""
-        return area(self.gaussians.cholesky) * self.objective.weigh(self.gaussians)
+        return self_product(self.gaussians.cholesky) * self.objective.weigh(self.gaussians)
 
     def _newton_step(self) -> Tensor:
         """Return Newton's steps of centre, factor and colours, (N, 5 + C)."""
@@ -79,6 +79,6 @@ class NewtonDescent:
         return -torch.cat([geometry, gradients.colors / curvature[:, None]], -1)
 
 
-def area(cholesky: Tensor) -> Tensor:
+def self_product(cholesky: Tensor) -> Tensor:
     """Return the sum of each Gaussian's squared weights over pixel centres, (N,)."""
     return math.pi * cholesky[:, ::2].clamp_min(_MIN_SIGMA).prod(-1)

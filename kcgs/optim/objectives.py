@@ -21,7 +21,7 @@ _NUM_STEPS = 10
 
 
 class Residual(NamedTuple):
-    """What a render lacks, by the root of what each pixel counts: Gaussians of these colours are by it too large."""
+    """What a render lacks, times the root of each pixel's weight, by which proposed colours are divided."""
 
     error: Tensor  # [C, H, W], its square is what a Gaussian may gain
     root: Tensor | float = 1.0  # [H, W]
@@ -59,7 +59,7 @@ class Objective(ABC):
         """Return what a render, (C, H, W), lacks."""
         return Residual(self.image - render)
 
-    def takes_one_pass(self, canvas: Canvas) -> bool:
+    def has_fused_gradients(self, canvas: Canvas) -> bool:
         """Whether gradients need no render of their own."""
         return False
 
@@ -92,13 +92,13 @@ class SquaredError(Objective):
             return mse_loss(render, self.image)
         return (self.weight * (render - self.image).square()).mean()
 
-    def takes_one_pass(self, canvas: Canvas) -> bool:
+    def has_fused_gradients(self, canvas: Canvas) -> bool:
         """Whether the error is that of all pixels of the render as it is."""
         return self.weight is None and canvas.bounds is None
 
     def gradients(self, canvas: Canvas, gaussians: Gaussians, render: Tensor | None = None) -> Gaussians:
         """Render and differentiate at once, where that is possible."""
-        if render is None and self.takes_one_pass(canvas):
+        if render is None and self.has_fused_gradients(canvas):
             return canvas.squared_error_gradients(gaussians, self.image)
         return super().gradients(canvas, gaussians, render)
 

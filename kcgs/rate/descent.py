@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs.codec import Parameters, Quantizer, SceneWriter
-from kcgs.optim import Canvas, Gaussians, NewtonDescent, Objective, area
+from kcgs.optim import Canvas, Gaussians, NewtonDescent, Objective, self_product
 
 from .bits import soft_bits
 
@@ -119,7 +119,7 @@ class RateDistortionDescent(NewtonDescent):
 
     def color_curvature(self) -> Tensor:
         """Return half the second derivative of the error by a colour, (N,)."""
-        return area(self.gaussians.cholesky).clamp_max(self._num_pixels) * self._error_weights
+        return self_product(self.gaussians.cholesky).clamp_max(self._num_pixels) * self._error_weights
 
     def _half_bit_gradient(self) -> Gaussians:
         """Return half the gradient of the price of the bits, which is 0 by means."""

@@ -8,7 +8,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from kcgs.fitting import FitConfig, least_impact, move_contours, propose_for
+from kcgs.fitting import FitConfig, lowest_weighted_impact, move_contours, propose_for
 from kcgs.functional import RegionMap
 from kcgs.optim import (
     At,
@@ -19,10 +19,10 @@ from kcgs.optim import (
     MsSsim,
     NewtonDescent,
     SquaredError,
-    area,
     count_iterations,
     draft_cutoff,
     run,
+    self_product,
 )
 from kcgs.scene import Scene
 
@@ -119,7 +119,7 @@ class FrameDescent(NewtonDescent):
         visibility, self.overlap = self._overlap()
         weights = self.objective.weigh(gaussians) * visibility
         weights = torch.where(self.movable_rows, weights, _FIXED_WEIGHT)
-        mask, new_colors = least_impact(canvas, gaussians, count, weights)
+        mask, new_colors = lowest_weighted_impact(canvas, gaussians, count, weights)
         colors = torch.where(self.movable_rows[:, None], new_colors, gaussians.colors)
         gaussians = gaussians._replace(colors=colors.masked_fill(mask[:, None], 0.0))
         self.velocity[mask], self.movable_rows = 0.0, self.movable_rows | mask
@@ -138,7 +138,7 @@ class FrameDescent(NewtonDescent):
         Gaussians in one place move together: with the second derivative of one alone, their steps would be too long.
         """
         total, sums = self.canvas.weight_sums(self.gaussians)
-        areas = area(self.gaussians.cholesky)
+        areas = self_product(self.gaussians.cholesky)
         visibility = (sums(torch.ones_like(total)) / (2 * areas)).clamp_max(1.0)
         return visibility, (sums(total) / areas / _USUAL_OVERLAP).clamp_min(1.0)
 

@@ -269,7 +269,7 @@ def test_no_step_waits_for_a_gpu(monkeypatch: pytest.MonkeyPatch, has_regions: b
         monkeypatch.setattr(owner, name, call)
 
     without_waits(divergence.StopAtDivergence, "act", True)
-    without_waits(report, "take_up", True)
+    without_waits(report, "collect_measurements", True)
     without_waits(gaussian_adam.GaussianAdam, "step", True)
     without_waits(log, "measure", False)
     without_waits(captured.CapturedStep, "__call__", True)

@@ -93,7 +93,7 @@ class AddAll:
         return math.inf if state.num_additions else 0.5
 
     def act(self, state: FitState) -> None:
-        state.waits, state.num_additions = True, state.num_additions + 1
+        state.num_additions += 1
         error = state.problem.image - state.render().detach()
         state.optimizer.append(state.field, propose_gaussians(error, 30, state.regions))
 

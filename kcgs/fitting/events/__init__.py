@@ -1,8 +1,8 @@
 """What happens to a fit besides its steps.
 
 An event that changes the scene is a frozen dataclass whose fields are its thresholds; whatever it counts is a field of
-:class:`~kcgs.fitting.state.FitState`, which a checkpoint keeps. It sets `state.waits`. Gaussians are
-added and removed by ``append`` and ``keep`` of the state's optimizer.
+:class:`~kcgs.fitting.state.FitState`, which a checkpoint keeps. Gaussians are added and removed
+by ``append`` and ``keep`` of the state's optimizer.
 """
 
 from .contours import AdaptContours, SettleContours

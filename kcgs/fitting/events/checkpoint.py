@@ -21,7 +21,7 @@ from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
-from .log import take_up
+from .log import collect_measurements
 
 # a checkpoint is written when the fit has run this many times as long as the last one took to write
 _RUN_PER_WRITE = 100.0
@@ -48,7 +48,7 @@ class Checkpoint:
         start = time.perf_counter()
         if start < self._next_write and state.iteration < self.problem.config.max_iterations:
             return
-        take_up(state, wait=True)
+        collect_measurements(state, wait=True)
         buffer = io.BytesIO()
         torch.save({"problem": _fingerprint(self.problem), "seconds": seconds, **_to_plain(state)}, buffer)
         content = buffer.getvalue()

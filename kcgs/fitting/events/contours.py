@@ -70,6 +70,5 @@ class SettleContours:
     @torch.no_grad()
     def act(self, state: FitState) -> None:
         """Move the contours."""
-        state.waits = True
         state.num_late_moves += 1
         _move_contours(state, max_rise=1.0)

@@ -85,7 +85,6 @@ class Densify:
         target = self.target(state)
         if not state.history or target == state.num_requested:
             return
-        state.waits = True
         if target < state.num_requested:
             remove_gaussians(state, state.num_gaussians - target)
         else:

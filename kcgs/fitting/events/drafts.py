@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from kcgs.fitting.state import FitState
 
-from .log import take_up
+from .log import collect_measurements
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,6 @@ class EndDrafts:
     def act(self, state: FitState) -> None:
         """Set the cutoff; the next state that is measured is the best, since drafts do not compare with it."""
         if state.is_draft:
-            state.waits = True
-            take_up(state, wait=True)
+            collect_measurements(state, wait=True)
             state.canvas = state.canvas._replace(cutoff=state.problem.config.cutoff)
             state.best_value = math.inf

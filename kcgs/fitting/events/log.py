@@ -38,7 +38,7 @@ class Log:
         if problem.config.max_seconds is None and state.iteration % _interval(state):
             return
         if state.num_gaussians <= problem.num_gaussians:
-            with state.room():
+            with state.running_ahead():
                 state.rendered = state.render()
                 measure(state, state.scene, state.rendered, self.clock.seconds())
 
@@ -57,10 +57,10 @@ def measure(state: FitState, scene: Scene, rendered: Tensor, seconds: float) -> 
     # of the Gaussians as they are now, since only the errors say whether they are the best
     scene = Scene(copy.deepcopy(scene.field), scene.regions)
     state.pending.append(Measurement(state.iteration, seconds, scene, errors))
-    take_up(state, wait=not state.history)
+    collect_measurements(state, wait=not state.history)
 
 
-def take_up(state: FitState, *, wait: bool) -> None:
+def collect_measurements(state: FitState, *, wait: bool) -> None:
     """Take the measurements that have arrived into the history, and keep the best scene; `wait`: all of them."""
     while state.pending and (wait or state.pending[0].errors.has_arrived()):
         iteration, seconds, scene, errors = state.pending.pop(0)

@@ -35,7 +35,6 @@ class Warmup:
         """Read the ids, but leave no region without its last Gaussian: nothing else would feel the error there."""
         if state.iteration % self._interval(state) or not 0 < state.iteration <= self._last(state):
             return
-        state.waits = True
         field, regions = state.field, state.regions
         assert regions is not None and field.region_ids is not None
         ids = lookup_regions(field.means, regions.labels)

@@ -19,7 +19,7 @@ from ..coarse_grids import make_blocks, max_spacing
 from ..interface import Gradients, Kernel, SplatInputs
 from ..whitened import least_exponent, support_radius
 from .gradients import Backward
-from .layout import AHEAD, COLUMNS, PAIR_COLUMNS, SHAPE_COLUMNS, TILE_COLS, TILE_ROWS, Batch, Lists, Table
+from .layout import COLUMNS, PAIR_COLUMNS, PREFETCH_DISTANCE, SHAPE_COLUMNS, TILE_COLS, TILE_ROWS, Batch, Lists, Table
 from .lists import arrange, list_pairs, measure
 from .loops import sum_rows
 from .schedule import ADDS, GATHERS, order_tasks
@@ -70,8 +70,8 @@ def _list_pairs(batch: Batch, table: Table, order: Any, cutoff: float) -> Lists:
     total = int(first_terms[-1])
     lists = Lists(
         order, gaussians, colors, np.empty(copies * blocks + 1, np.int64),
-        np.empty((total + AHEAD, PAIR_COLUMNS), np.int32), np.empty((total, SHAPE_COLUMNS), np.float32), first_terms,
-        np.empty(count, np.int32), table,
+        np.empty((total + PREFETCH_DISTANCE, PAIR_COLUMNS), np.int32), np.empty((total, SHAPE_COLUMNS), np.float32),
+        first_terms, np.empty(count, np.int32), table,
         np.zeros(copies * (blocks - len(table.mask_rows) + 1), np.bool_), np.float32(math.exp(least)),
     )  # fmt: skip
     histogram, room = np.zeros((parts, copies * blocks), np.int32), np.empty((total, 5), np.int32)

@@ -41,7 +41,7 @@ RUN = 4  # rows from an exponential to the next
 FIRST_HALF = 5  # of the columns, that the ellipse touches
 END_HALF = 6  # the last one + 1
 PAIR_COLUMNS = 7
-AHEAD = 4  # pairs before which a shape is asked for, since those of a block lie far apart
+PREFETCH_DISTANCE = 4  # pairs from a shape that is fetched to the present one, since those of a block lie far apart
 SHAPE_COLUMNS = 7
 
 

@@ -26,7 +26,18 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from .channels import Channels, Sums
-from .layout import AHEAD, END_HALF, FIRST, FIRST_HALF, GAUSSIAN, LAST, PAIR_COLUMNS, RUN, SHAPE_COLUMNS, TERMS
+from .layout import (
+    END_HALF,
+    FIRST,
+    FIRST_HALF,
+    GAUSSIAN,
+    LAST,
+    PAIR_COLUMNS,
+    PREFETCH_DISTANCE,
+    RUN,
+    SHAPE_COLUMNS,
+    TERMS,
+)
 from .simd import (
     HALF,
     LONG,
@@ -71,7 +82,7 @@ class _Rows:
         self.cutoff = broadcast(builder, arguments[7])
         self.is_masked = builder.icmp_signed(">=", arguments[9], long(0))
         self.is_rgb = builder.icmp_signed("==", self.channels, long(3))
-        prefetch(builder, builder.gep(shapes, [builder.mul(field(TERMS, AHEAD), long(SHAPE_COLUMNS))]))
+        prefetch(builder, builder.gep(shapes, [builder.mul(field(TERMS, PREFETCH_DISTANCE), long(SHAPE_COLUMNS))]))
         shape = builder.gep(shapes, [builder.mul(self.terms, long(SHAPE_COLUMNS))])
         self.shape = [broadcast(builder, builder.load(builder.gep(shape, [long(k)]))) for k in range(SHAPE_COLUMNS)]
         self.slope, self.change, self.first_y = self.shape[4:]
