@@ -88,3 +88,9 @@ def test_without_opencv(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(ImportError, match=r"pip install 'kcgs\[grabcut\]'"):
         cut(scene()[0])
+
+
+def test_a_click_that_the_mask_does_not_follow() -> None:
+    image, *_ = scene()
+    with pytest.warns(UserWarning, match="the click at 25, 16 is not in the background"):
+        cut(image, foreground=[[24, 16]], background=[[25, 16]])

@@ -8,6 +8,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument
 from kcgs.segment.cleanup import Cleanup, Prediction, merge_small
 from kcgs.segment.images import reduce_image, rgb_to_lab, to_pixels
@@ -65,6 +66,9 @@ def grabcut(
             or of the object and outside of the box.
         ImportError: OpenCV is not installed.
 
+    Warns:
+        UserWarning: a click that the mask does not follow.
+
     Example:
         ``segment(image, "grabcut", box=(30, 40, 200, 180), background=[(60, 70)])``
     """
@@ -84,6 +88,10 @@ def grabcut(
     mask = _cut(small, _scale_prompt(prompt, (columns.start, rows.start), scale))
     labels = torch.zeros(height, width, dtype=torch.int64)
     labels[rows, columns] = torch.from_numpy(_enlarge(crop, mask, max(scale)))
+    for points, region, whole in ((prompt.foreground, 1, "object"), (prompt.background, 0, "background")):
+        for x, y in points:
+            if labels[min(int(y), height - 1), min(int(x), width - 1)] != region:
+                warn_user(f"the click at {x:g}, {y:g} is not in the {whole}: colours, or another click, say no")
     return Prediction(labels, names=["background", "object"])
 
 
