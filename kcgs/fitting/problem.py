@@ -114,7 +114,7 @@ def make_problem(
         image = torch.full((check_count("channels", channels), *check_size("size", size)), torch.nan)
         regions = regions_of(image.shape[1:], regions)
         image = image if regions is None else image.to(regions.ids.device)
-    elif image is None:
+    elif image is None and size is not None:
         raise InvalidArgument("image", "given, unless objective is a loss of your own", None)
     elif size is not None:
         raise InvalidArgument("size", "None with an image", size)

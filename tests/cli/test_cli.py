@@ -7,7 +7,7 @@ import logging
 import signal
 import sys
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_args
 
 import pytest
 import torch
@@ -18,7 +18,7 @@ from kcgs.cli import demo
 from kcgs.cli.common import InterruptHandler
 from kcgs.cli.options import Objective
 from kcgs.data import load_image, load_labels, save_labels
-from kcgs.fitting import FitConfig
+from kcgs.fitting import ObjectiveName
 from kcgs.functional import psnr
 from kcgs.segment import segment
 from tests.cli.conftest import Kcgs
@@ -109,7 +109,7 @@ class TestFit:
 
     def test_objectives_are_those_of_fits(self) -> None:
         choices, _ = get_args(get_args(Objective)[0])  # of Annotated[Literal[...] | None, ...]
-        assert get_args(choices) == get_args(get_type_hints(FitConfig)["objective"])
+        assert get_args(choices) == get_args(ObjectiveName)
 
     def test_interrupt_saves_the_best_so_far(self, kcgs: Kcgs, monkeypatch: pytest.MonkeyPatch) -> None:
         def interrupt_third_step(handler: InterruptHandler, iteration: int, entry: Any) -> bool:

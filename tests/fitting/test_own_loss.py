@@ -72,7 +72,7 @@ class TestLoss:
             ({"image": None, "size": (32, 40), "target_psnr": 20.0}, "target_psnr must be None without an image"),
             ({"size": (32, 40)}, "size must be None with an image"),
             (
-                {"image": None, "objective": "psnr"},
+                {"image": None, "objective": "psnr", "size": (32, 40)},
                 "image must be given, unless objective is a loss of your own; got None",
             ),
             ({"objective": "l1"}, "objective must be 'auto', 'psnr' or 'ms-ssim'; got 'l1'"),
