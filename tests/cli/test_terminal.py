@@ -35,7 +35,7 @@ def interrupt(*_: object, **__: object) -> NoReturn:
         ("kcgs.segment.segment_with_scores", ("segment", "photo.png", "-o", "map.png")),
         ("kcgs.fitting.fit", ("fit", "photo.png", "-n", "5", "--regions", "none")),
         ("kcgs.codec.encode", ("encode", "scene.safetensors", "-o", "new.kcgs")),
-        ("kcgs.page.server.serve", ("view", "scene.safetensors")),
+        ("kcgs.page.serve", ("view", "scene.safetensors")),
     ],
 )
 def test_ctrl_c(kcgs: Kcgs, monkeypatch: pytest.MonkeyPatch, name: str, arguments: tuple[str, ...]) -> None:
