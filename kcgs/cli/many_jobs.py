@@ -49,12 +49,10 @@ def fit_one(job: FitJob) -> Outcome:
     try:
         fingerprint = _fingerprint(job)
         if job.output.is_file():
-            row = _read_row(record)
-            checksum = row.pop("checksum", None)
-            is_same = row.get("fingerprint") == fingerprint
-            if is_same and checksum == _checksum(job.output, row):
-                return Outcome(row, False)
-            is_unfinished = row == {"fingerprint": fingerprint} and checksum is None
+            kept = _read_kept(job, fingerprint)
+            if kept is not None:
+                return Outcome(kept, False)
+            is_unfinished = _read_row(record) == {"fingerprint": fingerprint}
             if not (is_unfinished or job.overwrite):
                 problem = "made with other settings or changed since"
                 raise FileExistsError(f"{job.output} exists, {problem}; --overwrite replaces it")
@@ -77,11 +75,17 @@ def fit_one(job: FitJob) -> Outcome:
 def is_done(job: FitJob) -> bool:
     """Return whether the scene is there, from the same image, mask and settings, and its row."""
     try:
-        row = _read_row(job.output.with_suffix(".json"))
-        checksum = row.pop("checksum", None)
-        return row.get("fingerprint") == _fingerprint(job) and checksum == _checksum(job.output, row)
+        return _read_kept(job, _fingerprint(job)) is not None
     except OSError:
         return False
+
+
+def _read_kept(job: FitJob, fingerprint: str) -> dict[str, Any] | None:
+    """Return the row beside a scene that was made from the same and not changed since; None: there is none."""
+    row = _read_row(job.output.with_suffix(".json"))
+    checksum = row.pop("checksum", None)
+    is_same = row.get("fingerprint") == fingerprint and checksum == _checksum(job.output, row)
+    return row if is_same else None
 
 
 def _read_row(record: Path) -> dict[str, Any]:

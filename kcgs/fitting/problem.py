@@ -84,7 +84,7 @@ class Problem:
     def objective(self) -> Objective:
         """What the descent lowers."""
         if callable(self.config.objective):
-            return LossObjective(self.config.objective, self.image if self.has_image else None)
+            return LossObjective(self.config.objective, self.image, self.has_image)
         return MsSsim(self.image, self.reduction) if self.config.objective == "ms-ssim" else self.loss
 
     @cached_property

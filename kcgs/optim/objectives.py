@@ -120,13 +120,15 @@ class LossObjective(Objective):
 
     Args:
         loss: from a render, (1, C, H, W), to a scalar.
-        image: (C, H, W), whose difference from the render is where Gaussians are added; None: the loss says where.
+        image: (C, H, W), whose difference from the render is where Gaussians are added.
+        has_image: False: the loss says where.
     """
 
     is_ranked_by_psnr = False
 
-    def __init__(self, loss: Loss, image: Tensor | None = None) -> None:
-        self.loss, self.target = loss, image
+    def __init__(self, loss: Loss, image: Tensor, has_image: bool = True) -> None:
+        super().__init__(image)
+        self.loss, self.has_image = loss, has_image
 
     def slope(self, render: Tensor) -> Tensor:
         """Return the gradient, times the number of values, as if the loss were their mean."""
@@ -147,8 +149,8 @@ class LossObjective(Objective):
 
         The longest that is tried changes one value by 1.
         """
-        if self.target is not None:
-            return Residual(self.target - render)
+        if self.has_image:
+            return super().residual(render)
         slope = self.slope(render)
         steps = [slope * (-(0.5**k) / slope.abs().max()) for k in range(_NUM_STEPS)]
         return Residual(min(steps, key=lambda step: float(self.value(render + step))))

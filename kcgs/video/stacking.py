@@ -8,22 +8,19 @@ import torch
 
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
-from kcgs.optim import Gaussians
 from kcgs.scene import Scene
 
 
 def stack(frames: Sequence[Scene], metadata: Mapping[str, str]) -> Scene:
     """Return the Gaussians and the maps of all frames as one scene."""
-    rows = [Gaussians.of(frame.field) for frame in frames]
-    means, cholesky, colors = (torch.stack(parts) for parts in zip(*(row[:3] for row in rows), strict=True))
-    maps, size = [frame.regions for frame in frames if frame.regions is not None], frames[0].size
+    field = GaussianField.stack([frame.field for frame in frames])
+    maps = [frame.regions for frame in frames if frame.regions is not None]
     if not maps:
-        return Scene(GaussianField(means, cholesky, colors, size=size), None, metadata)
-    region_ids = torch.stack([row.region_ids for row in rows if row.region_ids is not None])
+        return Scene(field, None, metadata)
     # a pair of regions has the same softness in all frames
     softness: dict[tuple[int, int], float] = {}
     for regions in maps:
         softness |= regions.softness if isinstance(regions.softness, Mapping) else {}
     labels = torch.stack([regions.labels for regions in maps])
     regions = RegionMap.from_labels(labels, softness or maps[0].softness)
-    return Scene(GaussianField(means, cholesky, colors, region_ids, size=size), regions, metadata)
+    return Scene(field, regions, metadata)
