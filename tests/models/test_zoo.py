@@ -16,7 +16,6 @@ from benchmarks.core.run import Options
 from benchmarks.zoo import PLANS, make_zoo
 from kcgs.functional import psnr
 from kcgs.onnx import scene_decoder
-from kcgs.scene import load
 from kcgs.zoo import Entry, entries, find
 
 MODELS = Path(kcgs.__file__).resolve().parent.parent / "models"
@@ -36,7 +35,7 @@ def test_zoo_is_whole_and_small() -> None:
 def test_entry(entry: Entry) -> None:
     path = find(f"zoo:{entry.name}")
     assert path.stat().st_size == entry.bytes
-    scene = load(path)
+    scene = kcgs.load(path)
     assert scene.num_gaussians == entry.num_gaussians
     image = images.load(PLANS[entry.name].image).image
     assert float(psnr(scene.render(), image)) == pytest.approx(entry.psnr, abs=0.02)
