@@ -1,14 +1,14 @@
 """Tasks that threads take from a shared counter, for compiled loops.
 
-A compiled function receives `tasks`, int64, a row for each, of which the first column is the number of tasks that must
-be done before: those of earlier phases. Its loop is::
+A compiled function receives `tasks`, int64, a row for each. The first column says how many tasks, from the first on,
+must be done before this one begins. Its loop is::
 
     k = first_task(tasks, counters)
     while k >= 0:
         ...  # task tasks[k]
-        k = next_task(tasks, counters)
+        k = next_task(tasks, counters, k)
 
-Which thread takes which task is left to chance, so a task writes where no other one of its phase does.
+Which thread takes which task is left to chance, so a task writes where none does that may run beside it.
 """
 
 from __future__ import annotations
@@ -29,12 +29,16 @@ from numba.extending import intrinsic
 from .program import inner
 from .threads import num_threads
 
-# columns of tasks and of counters
-START = 0  # tasks that must be done before
-_TAKEN = 0
-_DONE = 1
+# first column of tasks: how many of them, from the first on, must be done before
+START = 0
 
-# value of both counters after a failure, larger than any number of tasks
+# places of counters
+_TAKEN = 0
+_DONE = 1  # so many tasks, from the first on, are known to be done
+_FAILED = 2
+_FLAGS = 3  # 1 for each task that is done
+
+# number of taken tasks after a failure, larger than any number of tasks
 _CANCELLED = 1 << 62
 
 _MOST_RANGES = 256
@@ -44,25 +48,30 @@ _YIELDS = 40
 _MICROSECONDS = 20  # of a sleep
 
 
-def run_tasks(function: Callable[[Any, Any], None], tasks: Any, *, serial: bool = False) -> None:
-    """Call function(tasks, counters) on this thread and, unless `serial`, on others; return when all is done.
+def run_tasks(function: Callable[[Any, Any], None], tasks: Any, threads: int | None = None) -> None:
+    """Call function(tasks, counters) on this thread and on others; return when all is done.
 
     An exception in one thread ends the others after their present tasks, and reaches the caller.
+
+    Args:
+        function: a loop over tasks, as above.
+        tasks: see above.
+        threads: the most that are worth waking; None: as many as there are tasks.
     """
-    counters, errors = np.zeros(2, np.int64), list[BaseException]()
+    counters, errors = np.zeros(_FLAGS + len(tasks), np.int64), list[BaseException]()
 
     def run() -> None:
         try:
             function(tasks, counters)
         except BaseException as error:
             errors.append(error)
-            counters[:] = _CANCELLED
+            counters[_TAKEN], counters[_FAILED] = _CANCELLED, 1
 
     others: list[Future[None]] = []
     # one that starts too late finds nothing to do, so nobody waits for it
     with suppress(RuntimeError):  # no thread can be started: too many run, or the interpreter ends
-        count = 0 if serial else min(num_threads(), len(tasks)) - 1
-        others.extend(_pool(os.getpid(), num_threads() - 1).submit(run) for _ in range(count))
+        count = min(num_threads(), len(tasks) if threads is None else threads)
+        others.extend(_pool(os.getpid(), num_threads() - 1).submit(run) for _ in range(count - 1))
     run()
     if errors:
         wait(others)  # they still write to what the caller is about to give up
@@ -114,6 +123,17 @@ def _read(typing_context, counters, place):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
+def _write(typing_context, counters, place, value):  # type: ignore[no-untyped-def]
+    """Set a counter; what this thread wrote before is seen by those that read it."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        builder.store_atomic(arguments[2], _pointer(context, builder, signature, arguments), "release", 8)
+        return context.get_dummy_value()
+
+    return types.void(counters, types.int64, types.int64), generate
+
+
+@intrinsic
 def _yield_thread(typing_context):  # type: ignore[no-untyped-def]
     """Let another thread have the processor."""
 
@@ -153,9 +173,17 @@ def _long(value: int) -> ir.Constant:
 
 @inner
 def _wait(counters, count):  # type: ignore[no-untyped-def]
-    """Wait until so many tasks are done."""
-    yields = 0
-    while _read(counters, _DONE) < count:  # type: ignore[call-arg]
+    """Wait until so many tasks, from the first on, are done; return False if one has failed."""
+    done, yields = _read(counters, _DONE), 0  # type: ignore[call-arg]
+    while True:
+        while done < count and _read(counters, _FLAGS + done) != 0:  # type: ignore[call-arg]
+            done += 1
+        if done >= count:
+            # another thread may put less here: then what it has not seen is looked at again
+            _write(counters, _DONE, done)  # type: ignore[call-arg]
+            return _read(counters, _FAILED) == 0  # type: ignore[call-arg]
+        if _read(counters, _FAILED) != 0:  # type: ignore[call-arg]
+            return False
         if yields < _YIELDS:
             _yield_thread()
         else:
@@ -168,14 +196,13 @@ def first_task(tasks, counters):  # type: ignore[no-untyped-def]
     """Take a task, and wait for those before it; return its number, or -1 when all are done or one has failed."""
     k: int = _add(counters, _TAKEN)  # type: ignore[call-arg]
     if k < len(tasks):
-        _wait(counters, tasks[k, START])
-        return -1 if _read(counters, _DONE) >= _CANCELLED else k
+        return k if _wait(counters, tasks[k, START]) else -1
     _wait(counters, len(tasks))
     return -1
 
 
 @inner
-def next_task(tasks, counters):  # type: ignore[no-untyped-def]
-    """Say that a task is done, and take the next one, as `first_task` does."""
-    _add(counters, _DONE)  # type: ignore[call-arg]
+def next_task(tasks, counters, k):  # type: ignore[no-untyped-def]
+    """Say that task k is done, and take another one, as `first_task` does."""
+    _write(counters, _FLAGS + k, 1)  # type: ignore[call-arg]
     return first_task(tasks, counters)

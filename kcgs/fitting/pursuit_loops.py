@@ -58,7 +58,7 @@ def _average(planes, labels, block, averages, tasks, counters):  # type: ignore[
                     for x in range(column * block + 1, column * block + block):
                         total += sums[plane, x]
                     averages[plane, row, column] = share * total
-        k = next_task(tasks, counters)
+        k = next_task(tasks, counters, k)
 
 
 def evaluate(
@@ -111,7 +111,7 @@ def _evaluate(planes, labels, taps, gain, colors, tasks, counters):  # type: ign
                     _add(rows[plane, distance:], columns[plane, :-distance], is_same, taps[plane, distance])
             for plane in range(count - 1):
                 _divide(rows[plane], rows[count - 1], colors[plane, y], gain[y])
-        k = next_task(tasks, counters)
+        k = next_task(tasks, counters, k)
 
 
 @inner

@@ -151,7 +151,7 @@ def cut_windows(starts, regions, planes, weights, shape, places, members, window
                     for entry in range(starts[tile], starts[tile + 1]):
                         if regions[entry] == members[p]:
                             _copy_plane(planes[entry], weights, row * SIDE - top, col * SIDE - left, windows[p])
-        task = next_task(tasks, counters)
+        task = next_task(tasks, counters, task)
 
 
 @inner
@@ -215,7 +215,7 @@ def fill_planes(index, smooth, width_index, taps, starts, regions, planes, weigh
                     _blur_rows(half, blurred, is_empty, total)
                     _divide(total, down, across)
                     _copy_pixels(total, width_index, k, (image, top, left), weights[planes[entry]])
-        task = next_task(tasks, counters)
+        task = next_task(tasks, counters, task)
 
 
 @inner

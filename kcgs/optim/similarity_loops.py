@@ -305,4 +305,4 @@ def run_phases(scales, difference, squared, sums, has_gradient, tasks, counters)
             sums[k] = _score(scales, scale, channel, first, last, has_gradient)
         else:
             _sum(scales, difference, squared, sums, tasks, k)
-        k = next_task(tasks, counters)
+        k = next_task(tasks, counters, k)

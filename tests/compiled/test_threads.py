@@ -88,7 +88,7 @@ def fail_at(failing: int, done: Any, tasks: Any, counters: Any) -> None:
         if k == failing:
             raise ValueError("a task fails")
         done[k] = True
-        k = next_task(tasks, counters)
+        k = next_task(tasks, counters, k)
 
 
 @pytest.mark.usefixtures("three_threads")

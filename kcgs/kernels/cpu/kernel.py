@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from kcgs.compiled.tasks import chunks, phases, run_tasks
+from kcgs.compiled.workspace import Workspace
 from kcgs.maps import Membership
 
 from ..coarse_grids import make_blocks, max_spacing
@@ -26,10 +27,18 @@ from .schedule import ADDS, GATHERS, order_tasks
 from .simd import SIDE
 
 # Gaussians that one task lists, at least, and tasks at most
-_PART = 512
+_PART = 128
 _MOST_PARTS = 16
-# pairs up to which the calling thread does all: waking another costs as much
-_SERIAL_PAIRS = 300
+# Gaussians to list, and pairs to visit, that are worth waking a thread for
+_THREAD_GAUSSIANS = 256
+_THREAD_PAIRS = 300
+
+
+class Plan(NamedTuple):
+    """The lists of a render, and the memory that they are in."""
+
+    lists: Lists
+    workspace: Workspace  # no thread but the caller's holds it, so that it is back when the caller is done
 
 
 def kernel_for(inputs: SplatInputs) -> Kernel:
@@ -43,7 +52,7 @@ def kernel_for(inputs: SplatInputs) -> Kernel:
     )
 
 
-def plan(inputs: SplatInputs) -> Lists | None:
+def plan(inputs: SplatInputs) -> Plan | None:
     """List which Gaussians touch which blocks; None where a value is out of range."""
     means, cholesky, colors = (_array(t) for t in inputs.gaussians)
     if inputs.membership is not None and inputs.region_index is not None:
@@ -56,28 +65,33 @@ def plan(inputs: SplatInputs) -> Lists | None:
     return _list_pairs(batch, table, order, inputs.cutoff) if is_valid else None
 
 
-def _list_pairs(batch: Batch, table: Table, order: Any, cutoff: float) -> Lists:
+def _list_pairs(batch: Batch, table: Table, order: Any, cutoff: float) -> Plan:
     radius, least = support_radius(cutoff, torch.float32), least_exponent(cutoff, torch.float32)
     count, blocks = len(order), len(table.parents)
     copies = batch.num_images if table.num_maps == 1 else 1
-    gaussians, spans, counts = np.empty((count, COLUMNS)), np.empty((count, 2), np.int32), np.empty(count, np.int64)
-    colors = np.empty(batch.colors.size, np.float32)
+    workspace, threads = Workspace(), 1 + count // _THREAD_GAUSSIANS
+    empty = workspace.empty
+    gaussians, spans, counts = empty((count, COLUMNS), np.float64), empty((count, 2), np.int32), empty(count, np.int64)
+    colors = empty(batch.colors.size, np.float32)
     parts, measurement, listing = _list_tasks(count)
     spacing = max_spacing(cutoff)
-    run_tasks(partial(measure, batch, table, radius, spacing, order, gaussians, colors, spans, counts), measurement)
-    first_terms = np.zeros(count + 1, np.int64)
+    loop = partial(measure, batch, table, radius, spacing, order, gaussians, colors, spans, counts)
+    run_tasks(loop, measurement, threads)
+    first_terms = empty(count + 1, np.int64)
+    first_terms[0] = 0
     np.cumsum(counts, out=first_terms[1:])
     total = int(first_terms[-1])
     lists = Lists(
-        order, gaussians, colors, np.empty(copies * blocks + 1, np.int64),
-        np.empty((total + PREFETCH_DISTANCE, PAIR_COLUMNS), np.int32), np.empty((total, SHAPE_COLUMNS), np.float32),
-        first_terms, np.empty(count, np.int32), table,
-        np.zeros(copies * (blocks - len(table.mask_rows) + 1), np.bool_), np.float32(math.exp(least)),
+        order, gaussians, colors, empty(copies * blocks + 1, np.int64),
+        empty((total + PREFETCH_DISTANCE, PAIR_COLUMNS), np.int32), empty((total, SHAPE_COLUMNS), np.float32),
+        first_terms, empty(count, np.int32), table,
+        empty(copies * (blocks - len(table.mask_rows) + 1), np.bool_), np.float32(math.exp(least)),
     )  # fmt: skip
-    histogram, room = np.zeros((parts, copies * blocks), np.int32), np.empty((total, 5), np.int32)
-    # the phases of one range follow each other: another thread would only wait
-    run_tasks(partial(list_pairs, batch, radius, spans, room, histogram, lists), listing, serial=parts == 1)
-    return lists
+    with workspace.rest() as room:
+        histogram, found = room.empty((parts, copies * blocks), np.int32), room.empty((total, 5), np.int32)
+        # the phases of one range follow each other: another thread would only wait
+        run_tasks(partial(list_pairs, batch, radius, spans, found, histogram, lists), listing, min(threads, parts))
+    return Plan(lists, workspace)
 
 
 @functools.lru_cache(maxsize=64)
@@ -120,50 +134,51 @@ def _table(starts: Any, regions: Any, planes: Any, masks: Any, num_regions: int,
     return Table(num_regions, shape[0], np.array(grids), regions, tile_start, parents, parity, planes, masks)
 
 
-def render(lists: Lists, inputs: SplatInputs) -> Tensor:
+def render(plan: Plan, inputs: SplatInputs) -> Tensor:
     """Render (B, C, H, W)."""
     *batch, _, channels = inputs.colors.shape
     # numpy asks for huge pages where an array is large: first use costs a quarter of what torch.empty's does
     image = np.empty((*batch, channels, *inputs.size), np.float32)
     nothing = np.empty((0, 3), np.float32)
     backward = Backward(nothing, nothing, nothing, nothing)
-    nodes = _make_nodes(lists, channels)
-    _visit(lists, ADDS, backward, image.reshape(-1, *image.shape[-3:]), nodes, nodes[:0], nothing)
+    with plan.workspace.rest() as room:
+        nodes = _make_nodes(room, plan.lists, channels)
+        _visit(plan.lists, ADDS, backward, image.reshape(-1, *image.shape[-3:]), nodes, nodes[:0], nothing)
     return torch.from_numpy(image)
 
 
-def differentiate(lists: Lists, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
+def differentiate(plan: Plan, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
     """Return the gradients of means, cholesky (None each without `geometry`) and colors."""
-    means, cholesky, colors = _gather(lists, inputs, grad, GATHERS)
+    means, cholesky, colors = _gather(plan, inputs, grad, GATHERS)
     return (means, cholesky, colors) if geometry else (None, None, colors)
 
 
-def error_gradients(lists: Lists, inputs: SplatInputs, target: Tensor) -> Gradients:
+def error_gradients(plan: Plan, inputs: SplatInputs, target: Tensor) -> Gradients:
     """Return the gradients of half the squared error, summed over the pixels, against (B, C, H, W)."""
-    return _gather(lists, inputs, target, ADDS | GATHERS)
+    return _gather(plan, inputs, target, ADDS | GATHERS)
 
 
-def _gather(lists: Lists, inputs: SplatInputs, image: Tensor, kind: int) -> tuple[Tensor, Tensor, Tensor]:
-    channels = inputs.colors.shape[-1]
-    # the loops sum eight terms at a time
-    terms = np.empty((len(lists.pairs), -(-(channels + 5) // 8) * 8), np.float32)
+def _gather(plan: Plan, inputs: SplatInputs, image: Tensor, kind: int) -> tuple[Tensor, Tensor, Tensor]:
+    lists, channels = plan.lists, inputs.colors.shape[-1]
     values = image.resolve_neg().contiguous().numpy().reshape(-1, *image.shape[-3:])
-    slopes = _make_nodes(lists, channels)
-    nodes = np.zeros_like(slopes) if kind & ADDS else slopes[:0]
     means, cholesky, colors = (torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs.gaussians)
     gradients = (t.view(-1, t.shape[-1]).numpy() for t in (means, cholesky, colors))
     backward = Backward(_array(inputs.cholesky), *gradients)
-    _visit(lists, kind, backward, values, nodes, slopes, terms)
+    with plan.workspace.rest() as room:
+        # the loops sum eight terms at a time
+        terms = room.empty((len(lists.pairs), -(-(channels + 5) // 8) * 8), np.float32)
+        slopes = _make_nodes(room, lists, channels)
+        nodes = _make_nodes(room, lists, channels) if kind & ADDS else slopes[:0]
+        _visit(lists, kind, backward, values, nodes, slopes, terms)
     return means, cholesky, colors
 
 
-def _make_nodes(lists: Lists, channels: int) -> Any:
-    live = lists.live
-    return np.zeros(len(live) * SIDE * SIDE * channels if live.any() else 0, np.float32)
+def _make_nodes(room: Workspace, lists: Lists, channels: int) -> Any:
+    return room.empty(len(lists.live) * SIDE * SIDE * channels if lists.live.any() else 0, np.float32)
 
 
 def _visit(lists: Lists, kind: int, backward: Backward, image: Any, nodes: Any, slopes: Any, terms: Any) -> None:
     counts = tuple(lists.table.grids[: None if lists.live.any() else 1, TILE_ROWS].tolist())
-    tasks = order_tasks(counts, len(image), kind, len(lists.order))
+    tasks = order_tasks(counts, len(image), kind, len(lists.live), len(lists.order))
     loop = partial(sum_rows, lists, backward, image, nodes, slopes, terms)
-    run_tasks(loop, tasks, serial=len(lists.pairs) < _SERIAL_PAIRS)
+    run_tasks(loop, tasks, 1 + len(lists.pairs) // _THREAD_PAIRS)

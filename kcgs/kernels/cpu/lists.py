@@ -122,7 +122,7 @@ def measure(batch, table, radius, spacing, order, gaussians, colors, spans, coun
                     left, right = row_halves(g, row, height, width, radius)
                     count += (right + HALVES - 1) // HALVES - left // HALVES
             spans[i, 0], spans[i, 1], counts[i] = first, end, count
-        k = next_task(tasks, counters)
+        k = next_task(tasks, counters, k)
 
 
 @program.entry
@@ -134,7 +134,7 @@ def list_pairs(batch, radius, spans, blocks, histogram, lists, tasks, counters):
         radius: the largest |z| of a weight.
         spans: as `measure` returns them.
         blocks: (P, 5) int32, room for the block, rows and halves of each pair, by Gaussian.
-        histogram: (T, copies * K) int32, zeros.
+        histogram: (T, copies * K) int32, room for a number of each block.
         lists: Lists, of which first_terms has the sums of `counts`.
         tasks: ranges of Gaussians, then the sum over all, then the ranges once more; see `tasks.py`.
         counters: see there.
@@ -148,7 +148,7 @@ def list_pairs(batch, radius, spans, blocks, histogram, lists, tasks, counters):
             _sum_histogram(histogram, lists)
         else:
             _place_pairs(radius, blocks, histogram[k - parts - 1], lists, tasks[k, 1], tasks[k, 2])
-        k = next_task(tasks, counters)
+        k = next_task(tasks, counters, k)
 
 
 @inner
@@ -156,6 +156,7 @@ def _find_blocks(batch, radius, spans, blocks, histogram, lists, begin, end):  #
     table, per_image = lists.table, max(len(lists.order) // batch.num_images, 1)
     grids = table.grids
     num_regions, tile_start, block_regions = table.num_regions, table.tile_start, table.regions
+    histogram[:] = 0
     for i in range(begin, end):
         g, n, place = lists.gaussians[i], lists.order[i], lists.first_terms[i]
         image, region = n // per_image, batch.regions[n] if len(batch.regions) > 0 else 0
@@ -192,6 +193,7 @@ def _sum_histogram(histogram, lists):  # type: ignore[no-untyped-def]
     blocks, first = len(table.parents), len(table.mask_rows)
     for copy in range((len(start) - 1) // blocks):
         base = copy * (blocks - first + 1) - first
+        live[base + blocks] = False
         for block in range(blocks - 1, first - 1, -1):
             head = copy * blocks + block
             is_live = start[head] < start[head + 1]

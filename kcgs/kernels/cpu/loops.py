@@ -20,7 +20,7 @@ from .gradients import sum_terms
 from .layout import TILE_COLS, program
 from .lists import first_head, first_node_block, first_tile
 from .rows import add_rows, gather_rows
-from .schedule import ADDS, FIRST_FIELD, GATHERS, IMAGE, KIND, LEVEL_FIELD, ROW
+from .schedule import ADDS, CLEARS, FIRST_FIELD, GATHERS, IMAGE, KIND, LEVEL_FIELD, ROW, SUMS
 from .simd import HALF, SIDE, exchange_rows
 from .spline import add_refined, add_sampled, gather_refined, gather_sampled
 
@@ -34,8 +34,8 @@ def sum_rows(lists, backward, image, nodes, slopes, terms, tasks, counters):  # 
         backward: gradients.Backward; of no Gaussians where tasks add only.
         image: (B, C, H, W) float32: what tasks that add fill, the gradient where they gather, the target where they do
             both, of which the gradient is what they added minus that.
-        nodes: float32, the live blocks of all coarse grids, from zero; empty where no Gaussian is wide.
-        slopes: float32, gradients of the nodes, from zero.
+        nodes: float32, room for the blocks of all coarse grids; empty where no Gaussian is wide.
+        slopes: float32, room for the gradients of the nodes; empty likewise, or where tasks add only.
         terms: (P, C + 5, rounded up to a multiple of 8) float32, of which each pair's is set: w g of each channel,
             then v (z1, z2, z1 z1, z1 z2, z2 z2) with z times SCALE, see whitened.sums_to_gradients.
         tasks: see schedule.py.
@@ -49,11 +49,24 @@ def sum_rows(lists, backward, image, nodes, slopes, terms, tasks, counters):  # 
     offsets, ones = np.empty(4, np.int64), np.ones(SIDE, np.float32)
     k = first_task(tasks, counters)
     while k >= 0:
-        if tasks[k, KIND] == 0:
-            sum_terms(lists, backward, terms, tasks[k, FIRST_FIELD], tasks[k, FIRST_FIELD + 1])
+        first, end = tasks[k, FIRST_FIELD], tasks[k, FIRST_FIELD + 1]
+        if tasks[k, KIND] == SUMS:
+            sum_terms(lists, backward, terms, first, end)
+        elif tasks[k, KIND] == CLEARS:
+            for grid in (nodes, slopes):
+                _clear(lists, grid, SIDE * SIDE * channels, first, end)
         else:
             _visit_row(lists, tasks[k], image, pixels, nodes, slopes, terms, sums, offsets, ones)
-        k = next_task(tasks, counters)
+        k = next_task(tasks, counters, k)
+
+
+@inner
+def _clear(lists, grid, size, first, end):  # type: ignore[no-untyped-def]
+    """Set blocks of nodes to zero: the live ones, and the last of each copy, which stands for those that are not."""
+    copy = len(lists.table.parents) - len(lists.table.mask_rows) + 1
+    for block in range(first, end if len(grid) > 0 else first):
+        if lists.live[block] or (block + 1) % copy == 0:
+            grid[block * size : (block + 1) * size] = 0.0
 
 
 @part

@@ -1,53 +1,96 @@
-"""The tasks of the CPU kernel: rows of blocks, and ranges of Gaussians whose terms are summed, in phases."""
+"""The tasks of the CPU kernel: nodes that are cleared, rows of blocks, and ranges of Gaussians whose terms are summed.
+
+What adds begins with the coarsest nodes, which the finer ones read; what gathers ends there. Rows that gather into the
+same blocks of the coarser grid do so in a fixed order: the even one, then that whose number modulo 4 is 1, then 3. A
+task waits for the rows that it needs, and for what is listed before these, so that no thread waits for a whole level.
+"""
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from kcgs.compiled.tasks import chunks, phases
+from kcgs.compiled.tasks import chunks
 
-# columns of a task behind its START; or, of a sum, the first Gaussian and the last + 1 in FIRST_FIELD
-KIND = 1  # ADDS, GATHERS, both; 0: a sum
+# columns of a task behind its START; of a range, the first and the last + 1 in FIRST_FIELD
+KIND = 1  # ADDS, GATHERS, both; SUMS, CLEARS
 LEVEL_FIELD = 2
 FIRST_FIELD = 2
 IMAGE = 3
 ROW = 4  # of blocks, in its image and grid
 
+SUMS = 0
 ADDS = 1
 GATHERS = 2
+CLEARS = 4
 
-# Gaussians that one task sums up, at least, and tasks at most
-_SUM_SIZE = 512
-_MOST_SUMS = 64
+# blocks of nodes that one task clears, and Gaussians that one sums up, at least, and tasks at most
+_CLEAR_SIZE = 64
+_SUM_SIZE = 128
+_MOST_RANGES = 64
 
 
 @functools.lru_cache(maxsize=32)
-def order_tasks(counts: tuple[int, ...], batch: int, kind: int, num_gaussians: int) -> Any:
-    """Return the tasks of `batch` images with so many rows of blocks on each level; the levels above the pixels.
+def order_tasks(counts: tuple[int, ...], batch: int, kind: int, num_blocks: int, num_gaussians: int) -> Any:
+    """Return the tasks, (T, 5) int64.
 
-    What adds begins with the coarsest nodes, which the finer ones read. What gathers ends there: rows that add to the
-    same blocks of the coarser grid are in different phases, by their number modulo 4: 0 and 2, then 1, then 3.
+    Args:
+        counts: rows of blocks of an image on each level; the levels above the pixels.
+        batch: number of images.
+        kind: ADDS, GATHERS, or both at once.
+        num_blocks: blocks of nodes, all of which are cleared.
+        num_gaussians: summed up after what gathers.
     """
-    parts = []
+    cleared = _ranges(CLEARS, num_blocks if len(counts) > 1 else 0, _CLEAR_SIZE)
+    rows = _Rows(batch, len(cleared))
+    top = len(counts) - 1
     if kind & ADDS:
-        parts += [_rows(ADDS, level, counts[level], batch) for level in reversed(range(1, len(counts)))]
-    pixels = _rows(kind, 0, counts[0], batch)
+        for level in range(top, 0, -1):
+            rows.add(ADDS, level, range(counts[level]))
     if kind & GATHERS:
-        for rows in (pixels, *(_rows(GATHERS, level, counts[level], batch) for level in range(1, len(counts)))):
-            remainder = rows[:, 3] % 4
-            parts += [rows[members] for members in (remainder % 2 == 0, remainder == 1, remainder == 3)]
-        sums = chunks(num_gaussians, _SUM_SIZE, _MOST_SUMS)
-        parts.append(np.column_stack([np.zeros(len(sums), np.int64), sums, np.zeros(len(sums), np.int64)]))
+        for level in range(top + 1):
+            for first, step in ((0, 2), (1, 4), (3, 4)):
+                rows.add(kind if level == 0 else GATHERS, level, range(first, counts[level], step))
     else:
-        parts.append(pixels)
-    return phases(*parts)
+        rows.add(ADDS, 0, range(counts[0]))
+    sums = _ranges(SUMS, num_gaussians if kind & GATHERS else 0, _SUM_SIZE)
+    sums = [[len(cleared) + len(rows.tasks), *row] for row in sums]
+    return np.array([[0, *row] for row in cleared] + rows.tasks + sums, np.int64).reshape(-1, 5)
 
 
-def _rows(kind: int, level: int, count: int, batch: int) -> Any:
-    return np.column_stack([
-        np.full(batch * count, kind), np.full(batch * count, level),
-        np.repeat(np.arange(batch), count), np.tile(np.arange(count), batch),
-    ])  # fmt: skip
+class _Rows:
+    """Tasks of rows in their order, each with what must be done before."""
+
+    def __init__(self, batch: int, cleared: int) -> None:
+        self._batch, self._cleared = batch, cleared
+        self._ends: dict[tuple[int, int, int, int], int] = {}  # number of tasks up to that of a row
+        self.tasks: list[list[int]] = []
+
+    def add(self, kind: int, level: int, rows: range) -> None:
+        """Append rows of a level, of all images."""
+        for image in range(self._batch):
+            for row in rows:
+                needed = [self._ends.get((k, l, image, r), 0) for k, l, r in _needs(kind, level, row)]
+                self.tasks.append([max(needed, default=0) or self._cleared, kind, level, image, row])
+                for part in (ADDS, GATHERS):
+                    if kind & part:
+                        self._ends[part, level, image, row] = self._cleared + len(self.tasks)
+
+
+def _needs(kind: int, level: int, row: int) -> Iterator[tuple[int, int, int]]:
+    """Return the rows, if there are such, that must be done before one: kind, level and number."""
+    if kind & ADDS:  # its parents
+        yield from ((ADDS, level + 1, row // 2), (ADDS, level + 1, (row + 1) // 2))
+    if kind & GATHERS:  # its children, and those whose parents are its own
+        yield from ((GATHERS, level - 1, child) for child in (2 * row - 1, 2 * row, 2 * row + 1))
+        if row % 2 == 1:
+            yield from ((GATHERS, level, row - 1), (GATHERS, level, row + 1))
+        if row % 4 == 3:
+            yield from ((GATHERS, level, row - 2), (GATHERS, level, row + 2))
+
+
+def _ranges(kind: int, count: int, size: int) -> list[list[int]]:
+    return [[kind, first, end, 0] for first, end in chunks(count, size, _MOST_RANGES).tolist() if first < end]
