@@ -15,9 +15,11 @@ from __future__ import annotations
 
 import functools
 import os
+import threading
+import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
+from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -44,7 +46,7 @@ _CANCELLED = 1 << 62
 _MOST_RANGES = 256
 
 # times that a thread yields before it sleeps, so that one that was interrupted finds a processor
-_YIELDS = 40
+_YIELDS = 400
 _MICROSECONDS = 20  # of a sleep
 
 
@@ -58,30 +60,59 @@ def run_tasks(function: Callable[[Any, Any], None], tasks: Any, threads: int | N
         tasks: see above.
         threads: the most that are worth waking; None: as many as there are tasks.
     """
-    counters, errors = np.zeros(_FLAGS + len(tasks), np.int64), list[BaseException]()
+    counters, errors, running = np.zeros(_FLAGS + len(tasks), np.int64), list[BaseException](), list[None]()
 
     def run() -> None:
+        running.append(None)
         try:
             function(tasks, counters)
         except BaseException as error:
             errors.append(error)
             counters[_TAKEN], counters[_FAILED] = _CANCELLED, 1
+        finally:
+            running.pop()
 
-    others: list[Future[None]] = []
-    # one that starts too late finds nothing to do, so nobody waits for it
-    with suppress(RuntimeError):  # no thread can be started: too many run, or the interpreter ends
-        count = min(num_threads(), len(tasks) if threads is None else threads)
-        others.extend(_pool(os.getpid(), num_threads() - 1).submit(run) for _ in range(count - 1))
+    count = min(num_threads(), len(tasks) if threads is None else threads)
+    if count > 1:
+        # one that starts too late finds nothing to do, so nobody waits for it
+        _helpers(os.getpid()).call(run, count - 1)
     run()
     if errors:
-        wait(others)  # they still write to what the caller is about to give up
+        while running:  # they still write to what the caller is about to give up
+            time.sleep(1e-3)
         raise errors[0]
 
 
+class _Helpers:
+    """Threads that wait for work; an executor would take twice as long to wake one."""
+
+    def __init__(self) -> None:
+        self._work: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self._count = 0
+        self._lock = threading.Lock()
+
+    def call(self, function: Callable[[], None], count: int) -> None:
+        """Have so many threads call a function, or as many as the system lets start."""
+        if self._count < count:
+            self._start(count)
+        for _ in range(min(count, self._count)):
+            self._work.put(function)
+
+    def _start(self, count: int) -> None:
+        with self._lock, suppress(RuntimeError):  # too many run, or the interpreter ends
+            while self._count < count:
+                threading.Thread(target=self._serve, name="kcgs", daemon=True).start()
+                self._count += 1
+
+    def _serve(self) -> None:
+        while True:
+            self._work.get()()
+
+
 @functools.cache
-def _pool(process: int, threads: int) -> ThreadPoolExecutor:
+def _helpers(process: int) -> _Helpers:
     # by process, since threads do not survive a fork
-    return ThreadPoolExecutor(threads, thread_name_prefix="kcgs")
+    return _Helpers()
 
 
 def phases(*parts: Any) -> Any:

@@ -138,7 +138,7 @@ def _look_up(inputs: SplatInputs, check: bool) -> SplatInputs:
     """Put the positions of regions in place of their ids."""
     if inputs.ids is None or inputs.region_index is None:
         return inputs
-    region_ids = torch.atleast_2d(inputs.region_index)
+    region_ids = inputs.region_index if inputs.region_index.ndim == 2 else inputs.region_index[None]
     index = positions_of(region_ids, inputs.ids)
     known = index.device.type == "cpu" and int(index.numpy().min(initial=0)) >= 0
     if check and not known:

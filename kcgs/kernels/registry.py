@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from importlib import import_module
 
 import torch
@@ -23,8 +24,7 @@ def resolve(backend: str, inputs: SplatInputs) -> Kernel:
         ValueError: inputs that the backend does not take.
     """
     name = _choose(backend, inputs.means.device, inputs.means.dtype)
-    kernel: Kernel = import_module(f"{__package__}.{name}").kernel_for(inputs)
-    return kernel
+    return _kernel_for(name)(inputs)
 
 
 def prepare(backend: str, device: torch.device, dtype: torch.dtype, channels: int) -> None:
@@ -43,6 +43,12 @@ def _try(backend: str, device: torch.device, dtype: torch.dtype, channels: int) 
     image = kernel.render(plan, inputs)
     kernel.differentiate(plan, inputs, torch.ones_like(image), True)
     return image
+
+
+@functools.cache
+def _kernel_for(name: str) -> Callable[[SplatInputs], Kernel]:
+    function: Callable[[SplatInputs], Kernel] = import_module(f"{__package__}.{name}").kernel_for
+    return function
 
 
 def _choose(backend: str, device: torch.device, dtype: torch.dtype) -> str:
