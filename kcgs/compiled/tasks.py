@@ -128,6 +128,7 @@ def chunks(count: int, size: int, most: int) -> Any:
     return np.column_stack([ends[:-1], ends[1:]])
 
 
+@functools.lru_cache(maxsize=64)
 def ranges(count: int, size: int) -> Any:
     """Return tasks of one phase that are ranges of so many rows, each of at least about `size`: first and last + 1."""
     return phases(chunks(count, size, _MOST_RANGES))

@@ -62,7 +62,7 @@ def is_finite(field: GaussianField) -> bool:
     tables = field.means, field.cholesky, field.colors
     if not field.means.is_cpu:
         return bool((_magnitudes(tables) < _LARGEST).all())
-    return all(is_within(table, _LARGEST) for table in tables)
+    return is_within(tables, _LARGEST)
 
 
 @torch.no_grad()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from typing import Any
 
 import torch
@@ -23,6 +24,9 @@ from .settings import Adam, Bounds
 # steps of place in standard deviations and of log scale, and steps of colours: found on photos, and good on all images
 LEARNING_RATE = 0.14
 COLOR_LEARNING_RATE = 0.03
+# rows of geometry that one task moves, at least, and that are worth waking a thread for
+_TASK_ROWS = 512
+_THREAD_ROWS = 2048
 # pixels: factors are at least this before they are widened, so that their squares are far from underflow
 _MIN_FACTOR = 0.1
 # standard deviations by which a centre may lie outside the image
@@ -112,8 +116,7 @@ class GaussianAdam(Optimizer):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        for parameter in (parameter for group in self.param_groups for parameter in group["params"]):
-            _check_gradient(parameter.grad)
+        _check_gradients([parameter.grad for group in self.param_groups for parameter in group["params"]])
         for geometry, colors in zip(self.param_groups[::2], self.param_groups[1::2], strict=True):
             self._step_field(geometry, colors)
         return loss
@@ -235,11 +238,15 @@ def _step_geometry(state: dict[str, Tensor], group: dict[str, Any], finite: Tens
     means, cholesky = group["params"]
     gradients = [_gradient(means), _gradient(cholesky)]
     if _is_compiled(means, cholesky, *state.values()):
+        from kcgs.compiled.tasks import ranges, run_tasks
+
         from . import loops  # loads numba
 
         moves = means.requires_grad, cholesky.requires_grad
         adam = Adam(*_settings(group), *_averages(state))
-        loops.step_geometry(*_rows(means, cholesky, *gradients), moves, adam, _bounds(group))
+        arrays = _rows(means, cholesky, *gradients)
+        loop = partial(loops.step_geometry, *arrays, moves, adam, _bounds(group))
+        run_tasks(loop, ranges(len(arrays[0]), _TASK_ROWS), 1 + len(arrays[0]) // _THREAD_ROWS)
         increment_version([parameter for parameter in group["params"] if parameter.requires_grad])
         return
     step = _adam(state, local_gradient(cholesky, *gradients), group, finite)
@@ -303,27 +310,25 @@ def _averages(state: dict[str, Tensor]) -> list[Any]:
     return _rows(state["age"], state["average"], state["square"])
 
 
-def _check_gradient(gradient: Tensor | None) -> None:
-    if gradient is None or not _raises(gradient):
+def _check_gradients(gradients: list[Tensor | None]) -> None:
+    given = [gradient for gradient in gradients if gradient is not None and _raises(gradient)]
+    if given and _is_compiled(*given) and is_within(given, math.inf):
         return
-    if _is_compiled(gradient):
-        finite = is_within(gradient, math.inf)
-    else:
-        finite = verify(gradient.isfinite().all(), "gradients must be finite")
-    if not finite:
-        count = int((~gradient.isfinite()).sum())
-        received = f"{count} NaN or infinite values: the loss, or an operation between it and the render, is not finite"
-        raise InvalidArgument("gradients", "finite", received)
+    for gradient in given:
+        if not verify(gradient.isfinite().all(), "gradients must be finite"):
+            count = int((~gradient.isfinite()).sum())
+            cause = "the loss, or an operation between it and the render, is not finite"
+            raise InvalidArgument("gradients", "finite", f"{count} NaN or infinite values: {cause}")
 
 
-def is_within(table: Tensor, limit: float) -> bool:
-    """True where every number of a table on the CPU is smaller than a limit, and not NaN.
+def is_within(tables: Iterable[Tensor], limit: float) -> bool:
+    """True where every number of tables on the CPU is smaller than a limit, and not NaN.
 
     Compiled: between renders, whose data fill the caches, an operation of torch takes thirty microseconds.
     """
     from . import loops  # loads numba
 
-    return bool(loops.is_within(table.detach().numpy().ravel(), limit))
+    return bool(loops.is_within(tuple(table.detach().numpy().ravel() for table in tables), limit))
 
 
 def _gradient(parameter: Tensor) -> Tensor:

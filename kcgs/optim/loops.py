@@ -10,6 +10,7 @@ import math
 import numpy as np
 
 from kcgs.compiled.program import Program, inner
+from kcgs.compiled.tasks import first_task, next_task
 
 program = Program("optimizer")
 
@@ -32,17 +33,17 @@ def _move(numbers, average, square, adam, age):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _step(numbers, adam):  # type: ignore[no-untyped-def]
-    """Put Adam's steps in the place of gradients [N, K]; rows that came together have one age."""
+def _step(numbers, adam, begin):  # type: ignore[no-untyped-def]
+    """Put Adam's steps in the place of gradients [N, K], of rows from `begin` on; rows of one age go together."""
     first, columns = 0, numbers.shape[1]
     average, square, flat = adam.average.ravel(), adam.square.ravel(), numbers.ravel()
     while first < len(numbers):
-        last, age = first, adam.age[first, 0]
-        while last < len(numbers) and adam.age[last, 0] == age:
-            adam.age[last, 0] += 1
+        last, age = first, adam.age[begin + first, 0]
+        while last < len(numbers) and adam.age[begin + last, 0] == age:
+            adam.age[begin + last, 0] += 1
             last += 1
-        part = slice(first * columns, last * columns)
-        _move(flat[part], average[part], square[part], adam, np.float64(age + 1))
+        part = slice((begin + first) * columns, (begin + last) * columns)
+        _move(flat[first * columns : last * columns], average[part], square[part], adam, np.float64(age + 1))
         first = last
 
 
@@ -63,32 +64,45 @@ def _widen(l11, l21, l22, min_sigma):  # type: ignore[no-untyped-def]
 
 
 @program.entry
-def is_within(numbers, limit):  # type: ignore[no-untyped-def]
-    """True where every number of a row is smaller than a limit, and not NaN."""
+def is_within(tables, limit):  # type: ignore[no-untyped-def]
+    """True where every number of rows is smaller than a limit, and not NaN."""
     within = True
-    for i in range(len(numbers)):
-        within &= abs(numbers[i]) < limit
+    for numbers in tables:
+        for i in range(len(numbers)):
+            within &= abs(numbers[i]) < limit
     return within
 
 
 @program.entry
-def step_geometry(means, cholesky, means_gradient, cholesky_gradient, moves, adam, bounds):  # type: ignore[no-untyped-def]
-    """Move means [N, 2] and factors [N, 3]; `moves` says which of the two is not frozen."""
-    steps = np.empty((len(means), 5), np.float32)
-    for i in range(len(means)):
+def step_geometry(means, cholesky, means_gradient, cholesky_gradient, moves, adam, bounds, tasks, counters):  # type: ignore[no-untyped-def]
+    """Move means [N, 2] and factors [N, 3]; `moves` says which of the two is not frozen. Tasks are ranges of rows."""
+    k = first_task(tasks, counters)
+    while k >= 0:
+        rows = tasks[k, 1], tasks[k, 2]
+        _step_geometry(means, cholesky, means_gradient, cholesky_gradient, moves, adam, bounds, rows)
+        k = next_task(tasks, counters, k)
+
+
+@inner
+def _step_geometry(means, cholesky, means_gradient, cholesky_gradient, moves, adam, bounds, rows):  # type: ignore[no-untyped-def]
+    begin, end = rows
+    steps = np.empty((end - begin, 5), np.float32)
+    for i in range(begin, end):
         l11, l21, l22 = cholesky[i, 0], cholesky[i, 1], cholesky[i, 2]
         gx, gy = means_gradient[i, 0], means_gradient[i, 1]
         g11, g21, g22 = cholesky_gradient[i, 0], cholesky_gradient[i, 1], cholesky_gradient[i, 2]
-        steps[i, 0], steps[i, 1] = l11 * gx + l21 * gy, l22 * gy
-        steps[i, 2], steps[i, 3], steps[i, 4] = l11 * g11 + l21 * g21, l22 * g21, l22 * g22
-    _step(steps, adam)
+        step = steps[i - begin]
+        step[0], step[1] = l11 * gx + l21 * gy, l22 * gy
+        step[2], step[3], step[4] = l11 * g11 + l21 * g21, l22 * g21, l22 * g22
+    _step(steps, adam, begin)
     most, diagonal = bounds.max_step, math.hypot(bounds.height, bounds.width)
-    for i in range(len(means)):
+    for i in range(begin, end):
+        step = steps[i - begin]
         l11, l21, l22 = np.float64(cholesky[i, 0]), np.float64(cholesky[i, 1]), np.float64(cholesky[i, 2])
-        d1, d2 = _clamp(np.float64(steps[i, 0]), -most, most), _clamp(np.float64(steps[i, 1]), -most, most)
+        d1, d2 = _clamp(np.float64(step[0]), -most, most), _clamp(np.float64(step[1]), -most, most)
         x, y = means[i, 0] + l11 * d1, means[i, 1] + l21 * d1 + l22 * d2
-        k11, k22 = _clamp(np.float64(steps[i, 2]), -most, most), _clamp(np.float64(steps[i, 4]), -most, most)
-        k21, e1, e2, gap = _clamp(np.float64(steps[i, 3]), -most, most), math.exp(k11), math.exp(k22), k11 - k22
+        k11, k22 = _clamp(np.float64(step[2]), -most, most), _clamp(np.float64(step[4]), -most, most)
+        k21, e1, e2, gap = _clamp(np.float64(step[3]), -most, most), math.exp(k11), math.exp(k22), k11 - k22
         mean = 0.5 * (e1 + e2) if abs(gap) < 1e-4 else (e1 - e2) / gap
         l21 = _clamp(l21 * e1 + l22 * k21 * mean, -diagonal, diagonal)
         l11, l22 = _clamp(l11 * e1, bounds.min_factor, diagonal), _clamp(l22 * e2, bounds.min_factor, diagonal)
@@ -104,7 +118,7 @@ def step_geometry(means, cholesky, means_gradient, cholesky_gradient, moves, ada
 def step_tables(tables, gradient, adam):  # type: ignore[no-untyped-def]
     """Move tables of rows whose gradients [N, K] are beside each other."""
     steps, column = gradient.copy(), 0
-    _step(steps, adam)
+    _step(steps, adam, 0)
     for table in tables:
         for i in range(len(table)):
             for k in range(table.shape[1]):
