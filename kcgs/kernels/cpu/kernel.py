@@ -29,8 +29,9 @@ from .simd import SIDE
 # Gaussians that one task lists, at least, and tasks at most
 _PART = 128
 _MOST_PARTS = 16
-# Gaussians to list, and pairs to visit, that are worth waking a thread for
-_THREAD_GAUSSIANS = 256
+# Gaussians to measure, and pairs to list and to visit, that are worth waking a thread for
+_THREAD_GAUSSIANS = 2048
+_THREAD_LISTED_PAIRS = 3000
 _THREAD_PAIRS = 300
 
 
@@ -69,14 +70,14 @@ def _list_pairs(batch: Batch, table: Table, order: Any, cutoff: float) -> Plan:
     radius, least = support_radius(cutoff, torch.float32), least_exponent(cutoff, torch.float32)
     count, blocks = len(order), len(table.parents)
     copies = batch.num_images if table.num_maps == 1 else 1
-    workspace, threads = Workspace(), 1 + count // _THREAD_GAUSSIANS
+    workspace = Workspace()
     empty = workspace.empty
     gaussians, spans, counts = empty((count, COLUMNS), np.float64), empty((count, 2), np.int32), empty(count, np.int64)
     colors = empty(batch.colors.size, np.float32)
     parts, measurement, listing = _list_tasks(count)
     spacing = max_spacing(cutoff)
     loop = partial(measure, batch, table, radius, spacing, order, gaussians, colors, spans, counts)
-    run_tasks(loop, measurement, threads)
+    run_tasks(loop, measurement, 1 + count // _THREAD_GAUSSIANS)
     first_terms = empty(count + 1, np.int64)
     first_terms[0] = 0
     np.cumsum(counts, out=first_terms[1:])
@@ -90,7 +91,8 @@ def _list_pairs(batch: Batch, table: Table, order: Any, cutoff: float) -> Plan:
     with workspace.rest() as room:
         histogram, found = room.empty((parts, copies * blocks), np.int32), room.empty((total, 5), np.int32)
         # the phases of one range follow each other: another thread would only wait
-        run_tasks(partial(list_pairs, batch, radius, spans, found, histogram, lists), listing, min(threads, parts))
+        threads = min(1 + total // _THREAD_LISTED_PAIRS, parts)
+        run_tasks(partial(list_pairs, batch, radius, spans, found, histogram, lists), listing, threads)
     return Plan(lists, workspace)
 
 

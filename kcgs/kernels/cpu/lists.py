@@ -182,14 +182,20 @@ def _find_blocks(batch, radius, spans, blocks, histogram, lists, begin, end):  #
 @inner
 def _sum_histogram(histogram, lists):  # type: ignore[no-untyped-def]
     """Turn numbers of pairs into places of the first, set `start`, and mark the blocks of nodes that are not zero."""
-    table, start, live, total = lists.table, lists.start, lists.live, 0
+    table, start, live = lists.table, lists.start, lists.live
+    # along rows of the histogram, which are vectors
+    start[:] = 0
+    for part in range(len(histogram)):
+        for head in range(len(start) - 1):
+            start[head + 1] += histogram[part, head]
     for head in range(len(start) - 1):
-        start[head] = total
-        for part in range(len(histogram)):
+        start[head + 1] += start[head]
+    places = start.copy()
+    for part in range(len(histogram)):
+        for head in range(len(start) - 1):
             count = histogram[part, head]
-            histogram[part, head] = total
-            total += count
-    start[len(start) - 1] = total
+            histogram[part, head] = places[head]
+            places[head] += count
     blocks, first = len(table.parents), len(table.mask_rows)
     for copy in range((len(start) - 1) // blocks):
         base = copy * (blocks - first + 1) - first
