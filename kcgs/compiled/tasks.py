@@ -206,15 +206,16 @@ def _long(value: int) -> ir.Constant:
 @inner
 def _wait(counters, count):  # type: ignore[no-untyped-def]
     """Wait until so many tasks, from the first on, are done; return False if one has failed."""
-    done, yields = _read(counters, _DONE), 0  # type: ignore[call-arg]
+    done: int = _read(counters, _DONE)  # type: ignore[call-arg]
+    yields = 0
     while True:
-        while done < count and _read(counters, _FLAGS + done) != 0:  # type: ignore[call-arg]
+        while done < count and _read(counters, _FLAGS + done) != 0:
             done += 1
         if done >= count:
             # another thread may put less here: then what it has not seen is looked at again
-            _write(counters, _DONE, done)  # type: ignore[call-arg]
-            return _read(counters, _FAILED) == 0  # type: ignore[call-arg]
-        if _read(counters, _FAILED) != 0:  # type: ignore[call-arg]
+            _write(counters, _DONE, done)
+            return _read(counters, _FAILED) == 0
+        if _read(counters, _FAILED) != 0:
             return False
         if yields < _YIELDS:
             _yield_thread()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import threading
 from collections.abc import Iterator
@@ -57,6 +58,16 @@ class Workspace:
         finally:
             self._used = used
             self._is_lent.release()
+
+
+def borrowed(array: Any) -> Any:
+    """Return a view of a contiguous array, for `run_tasks`, that does not keep its memory.
+
+    A thread holds what it was given a moment longer than it works on it: the caller's next array would be new memory.
+    """
+    if array.nbytes == 0:
+        return array
+    return np.ndarray(array.shape, array.dtype, (ctypes.c_byte * array.nbytes).from_address(array.ctypes.data))
 
 
 _thread = threading.local()

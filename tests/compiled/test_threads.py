@@ -91,8 +91,26 @@ def fail_at(failing: int, done: Any, tasks: Any, counters: Any) -> None:
         k = next_task(tasks, counters, k)
 
 
+@_program.entry
+def count_too_early(done: Any, early: Any, tasks: Any, counters: Any) -> None:
+    k = first_task(tasks, counters)
+    while k >= 0:
+        for other in range(tasks[k, 0]):
+            early[k] += not done[other]
+        done[k] = True
+        k = next_task(tasks, counters, k)
+
+
 @pytest.mark.usefixtures("three_threads")
 class TestTasks:
+    def test_waits_for_the_tasks_before(self) -> None:
+        starts = np.random.default_rng(0).random(300) * np.arange(300)
+        tasks = starts.astype(np.int64)[:, None]
+        for threads in (None, 2, 1):
+            done, early = np.zeros(len(tasks), np.bool_), np.zeros(len(tasks), np.int64)
+            run_tasks(partial(count_too_early, done, early), tasks, threads)
+            assert done.all() and not early.any()
+
     @pytest.mark.parametrize("failing", [0, 3, 7])
     def test_failure_of_any_thread(self, failing: int) -> None:
         """The caller gets the exception, and no later phase begins."""

@@ -80,8 +80,8 @@ def _errors_on_cpu(problem: Problem, rendered: Tensor) -> Tensor:
     """
     from kcgs.fitting.measurement import mean_errors  # loads numba
 
-    arrays = [t.numpy() for t in (rendered, problem.image, problem.band)]
-    errors = mean_errors(*arrays, problem.config.loss == "l2")
+    render, image, band = (t.numpy() for t in (rendered, problem.image, problem.band))
+    errors = mean_errors(render, image, band, problem.config.loss == "l2")
     value = errors[1] if problem.objective.is_ranked_by_psnr else float(problem.objective.value(rendered))
     loss = value if problem.has_own_loss else errors[0]
     return torch.tensor([loss, *errors[1:], value], dtype=torch.float64)

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from kcgs.compiled.tasks import chunks, phases, run_tasks
-from kcgs.compiled.workspace import Workspace
+from kcgs.compiled.workspace import Workspace, borrowed
 from kcgs.maps import Membership
 
 from ..coarse_grids import make_blocks, max_spacing
@@ -162,16 +162,17 @@ def error_gradients(plan: Plan, inputs: SplatInputs, target: Tensor) -> Gradient
 
 def _gather(plan: Plan, inputs: SplatInputs, image: Tensor, kind: int) -> tuple[Tensor, Tensor, Tensor]:
     lists, channels = plan.lists, inputs.colors.shape[-1]
-    values = image.resolve_neg().contiguous().numpy().reshape(-1, *image.shape[-3:])
     means, cholesky, colors = (torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs.gaussians)
     gradients = (t.view(-1, t.shape[-1]).numpy() for t in (means, cholesky, colors))
     backward = Backward(_array(inputs.cholesky), *gradients)
     with plan.workspace.rest() as room:
+        if image.is_neg() or not image.is_contiguous():
+            image = torch.from_numpy(room.empty(tuple(image.shape), np.float32)).copy_(image)
         # the loops sum eight terms at a time
         terms = room.empty((len(lists.pairs), -(-(channels + 5) // 8) * 8), np.float32)
         slopes = _make_nodes(room, lists, channels)
         nodes = _make_nodes(room, lists, channels) if kind & ADDS else slopes[:0]
-        _visit(lists, kind, backward, values, nodes, slopes, terms)
+        _visit(lists, kind, backward, image.numpy().reshape(-1, *image.shape[-3:]), nodes, slopes, terms)
     return means, cholesky, colors
 
 
@@ -182,5 +183,5 @@ def _make_nodes(room: Workspace, lists: Lists, channels: int) -> Any:
 def _visit(lists: Lists, kind: int, backward: Backward, image: Any, nodes: Any, slopes: Any, terms: Any) -> None:
     counts = tuple(lists.table.grids[: None if lists.live.any() else 1, TILE_ROWS].tolist())
     tasks = order_tasks(counts, len(image), kind, len(lists.live), len(lists.order))
-    loop = partial(sum_rows, lists, backward, image, nodes, slopes, terms)
+    loop = partial(sum_rows, lists, backward, borrowed(image), nodes, slopes, terms)
     run_tasks(loop, tasks, 1 + len(lists.pairs) // _THREAD_PAIRS)

@@ -73,7 +73,7 @@ class _Rows:
         """Append rows of a level, of all images."""
         for image in range(self._batch):
             for row in rows:
-                needed = [self._ends.get((k, l, image, r), 0) for k, l, r in _needs(kind, level, row)]
+                needed = [self._ends.get((part, grid, image, n), 0) for part, grid, n in _needs(kind, level, row)]
                 self.tasks.append([max(needed, default=0) or self._cleared, kind, level, image, row])
                 for part in (ADDS, GATHERS):
                     if kind & part:
