@@ -37,6 +37,8 @@ LAYERS = [
     {"_atomic", "_check", "_decode", "_memory", "_progress", "_repr", "_sizes", "_suffixes", "_warn"},
     {"errors", "_rows"},
 ]
+# methods that call what is above them, which they import when they are called
+UPWARD = {("kcgs.scene", "kcgs.files"), ("kcgs.scene", "kcgs.onnx")}
 # modules beside the `__init__` of a room that other rooms import, two of a room at most: they load numba or Triton
 DOORS = {"kcgs.compiled.program", "kcgs.compiled.tasks", "kcgs.kernels.cuda.program"}
 # what to say: what not to
@@ -87,7 +89,7 @@ def graph() -> dict[str, set[str]]:
     """Return the modules of kcgs that each module imports, but for itself and its own package."""
     edges = {module: {entry.module for entry in imports_of(module)} & MODULES.keys() for module in MODULES}
     return {
-        module: {t for t in targets if t != module and not module.startswith(f"{t}.")}
+        module: {t for t in targets if t != module and not module.startswith(f"{t}.") and (module, t) not in UPWARD}
         for module, targets in edges.items()
     }
 

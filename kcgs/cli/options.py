@@ -28,7 +28,9 @@ Threshold = Annotated[
 ]
 Objective = Annotated[
     Literal["auto", "psnr", "ms-ssim"] | None,
-    typer.Option(help="What to maximize; auto, the default: ms-ssim for a compressed file, else psnr."),
+    typer.Option(
+        help="What to maximize; auto, the default: ms-ssim with --target-bytes and for kcgs encode, else psnr."
+    ),
 ]
 
 

@@ -58,7 +58,7 @@ def run_tasks(function: Callable[[Any, Any], None], tasks: Any, threads: int | N
     Args:
         function: a loop over tasks, as above.
         tasks: see above.
-        threads: the most that are worth waking; None: as many as there are tasks.
+        threads: the most that the work is enough for; None: as many as there are tasks.
     """
     counters, errors, running = np.zeros(_FLAGS + len(tasks), np.int64), list[BaseException](), list[None]()
 

@@ -133,8 +133,8 @@ class FitConfig(BaseModel):
         return math.inf if self.iterations is None and self.max_seconds is not None else self.num_iterations
 
     def __repr__(self) -> str:
-        changed = self.model_dump(exclude_defaults=True)
-        return shorten(f"FitConfig({', '.join(f'{name}={value!r}' for name, value in changed.items())})")
+        changed = [(name, value) for name, value in self if value != type(self).model_fields[name].default]
+        return shorten(f"FitConfig({', '.join(f'{name}={value!r}' for name, value in changed)})")
 
     @classmethod
     def from_recipe(cls, recipe: str | FitConfig, **settings: Any) -> FitConfig:
@@ -149,7 +149,7 @@ class FitConfig(BaseModel):
             ValueError: unknown recipe or setting, or a value out of range.
         """
         if isinstance(recipe, FitConfig):
-            values = recipe.model_dump()
+            values = dict(recipe)  # not `model_dump`, which takes a dataclass apart, such as an event
         elif not isinstance(recipe, str):
             raise InvalidArgumentType("recipe", "a name or a FitConfig", type(recipe).__name__)
         elif recipe not in available_recipes():

@@ -12,7 +12,7 @@ from kcgs.compiled.tasks import first_task, next_task, ranges, run_tasks
 
 program = Program("measurement of a fit")
 
-# columns that one task sums up, at least, and pixels that are worth waking a thread for
+# columns that one task sums up, at least, and pixels for which another thread is woken
 _COLUMNS = 64
 _THREAD_PIXELS = 1 << 16
 

@@ -103,7 +103,7 @@ class FitState(FieldDescent):
 
     @property
     def waits(self) -> bool:
-        """True where the next step waits for the device, to learn how much room the Gaussians take, after an event."""
+        """True where the next step waits for the device, which after an event counts how much room its lists take."""
         content = self._content()
         return self.lacks_room or len(content) != len(self._stepped) or any(map(is_not, content, self._stepped))
 

@@ -64,7 +64,7 @@ class Kernel(NamedTuple):
     checks_values: `plan` returns None where a value is not finite or beyond the limits in whitened.py; else values have
         been checked.
     takes_one_image: Gaussians of one image may come without B, as do the results then; else B is there.
-    looks_up_regions: `region_index` comes as region ids, with `ids`; negative ones are refused by None, too, and
+    looks_up_regions: `region_index` comes as region ids, with `ids`. `plan` returns None for negative ones, too;
         `foreign` of the plan is the number of those that the map does not hold.
     """
 

@@ -117,9 +117,9 @@ def _step(  # type: ignore[no-untyped-def]
     mask = mask & (largest < float("inf"))
 
     if COLORS or OPACITIES:
-        years = tl.load(color_age + row, mask=mask, other=0.0) + 1.0
-        tl.store(color_age + row, years, mask=mask)
-        rate, root = _rate(color_lr, color_beta1, color_beta2, years.to(tl.float64), COLOR_LR_LOADED)
+        steps = tl.load(color_age + row, mask=mask, other=0.0) + 1.0
+        tl.store(color_age + row, steps, mask=mask)
+        rate, root = _rate(color_lr, color_beta1, color_beta2, steps.to(tl.float64), COLOR_LR_LOADED)
         for k in range(COLUMNS):
             is_color = mask & (k < CHANNELS)
             gradient = _gradient(colors_gradient, row * CHANNELS + k, is_color, COLORS)
@@ -137,9 +137,9 @@ def _step(  # type: ignore[no-untyped-def]
         l11 = tl.load(cholesky + 3 * row, mask=mask, other=1.0).to(tl.float64)
         l21 = tl.load(cholesky + 3 * row + 1, mask=mask, other=0.0).to(tl.float64)
         l22 = tl.load(cholesky + 3 * row + 2, mask=mask, other=1.0).to(tl.float64)
-        years = tl.load(age + row, mask=mask, other=0.0) + 1.0
-        tl.store(age + row, years, mask=mask)
-        rate, root = _rate(lr, beta1, beta2, years.to(tl.float64), LR_LOADED)
+        steps = tl.load(age + row, mask=mask, other=0.0) + 1.0
+        tl.store(age + row, steps, mask=mask)
+        rate, root = _rate(lr, beta1, beta2, steps.to(tl.float64), LR_LOADED)
         place = 5 * row
         d1 = _move(l11 * gx + l21 * gy, average, square, place, mask, rate, root, beta1, beta2, eps)
         d2 = _move(l22 * gy, average, square, place + 1, mask, rate, root, beta1, beta2, eps)

@@ -24,7 +24,7 @@ from .settings import Adam, Bounds
 # steps of place in standard deviations and of log scale, and steps of colours: found on photos, and good on all images
 LEARNING_RATE = 0.14
 COLOR_LEARNING_RATE = 0.03
-# rows of geometry that one task moves, at least, and that are worth waking a thread for
+# rows of geometry that one task moves, at least, and for which another thread is woken
 _TASK_ROWS = 512
 _THREAD_ROWS = 2048
 # pixels: factors are at least this before they are widened, so that their squares are far from underflow

@@ -44,7 +44,7 @@ class Objective(ABC):
     def slope(self, render: Tensor) -> Tensor:
         """Return half the gradient at a render, (C, H, W), in whose memory it may be.
 
-        A factor is nothing to Adam. Newton's method takes half of the squared error's.
+        Adam ignores a constant factor. Newton's method takes half of the squared error's.
         """
 
     @abstractmethod

@@ -13,6 +13,8 @@ from torch import Tensor
 
 from kcgs import RegionMap, RegionSplatRenderer, fit
 from kcgs.fitting import initial_field, lowest_impact, propose_gaussians
+from kcgs.fitting.config import FitConfig
+from kcgs.fitting.events.densify import Densify
 from kcgs.fitting.state import FitState
 from kcgs.functional import psnr
 from kcgs.optim import GaussianAdam
@@ -109,6 +111,14 @@ def test_an_event_and_an_optimizer_of_ones_own(tmp_path: Path) -> None:
     assert counts[28] == 2 and counts[-1] == 32 and result.history[-1].psnr > result.history[0].psnr + 5
     with pytest.raises(ValueError, match="checkpoint must be None with densify of your own"):
         fit(image(), LABELS, 60, checkpoint=tmp_path / "state", **settings)
+
+
+def test_an_event_that_is_a_dataclass() -> None:
+    """Settings that hold one may be given as a recipe, and changed."""
+    event = Densify(steps=2)
+    config = FitConfig.from_recipe(FitConfig(densify=event), iterations=40)
+    assert config.densify is event and "Densify(" in repr(config)
+    assert fit(image(), LABELS, 20, recipe=config).scene.num_gaussians == 20
 
 
 class TestLoop:

@@ -132,7 +132,7 @@ class TestEditing(BaseTester):
             (
                 lambda s: recolor_region(s, BOX),
                 ValueError,
-                "color must be given, or gain and bias; got both or neither",
+                "color must be given, or gain or bias; got both or neither",
             ),
             (lambda s: recolor_region(s, BOX, 1.0, color="red"), ValueError, "got both or neither"),
             (lambda s: recolor_region(s, BOX, color="reddish"), ValueError, "color must be a name such as red"),

@@ -60,7 +60,7 @@ class Densify:
         return most - round((most - final) * int(phase * (self.removals + 1)) / self.removals)
 
     def due(self, state: FitState) -> float:
-        """Return about when the schedule asks for another number of Gaussians: not after it does."""
+        """Return the progress at which the schedule asks for another number of Gaussians, or somewhat less."""
         return state.progress if self.target(state) != state.num_requested else self._next_change(state)
 
     def _next_change(self, state: FitState) -> float:

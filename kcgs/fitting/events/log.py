@@ -27,7 +27,7 @@ class Log:
         self.clock = clock
 
     def due(self, state: FitState) -> float:
-        """Return about when the next measurement is due: not after it is."""
+        """Return the progress of the next measurement, or somewhat less."""
         if state.problem.config.max_seconds is None:
             return state.next_multiple(_interval(state))
         return state.progress + 1.0 / _HISTORY_LENGTH if state.history or state.pending else 0.0

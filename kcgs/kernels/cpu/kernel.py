@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
+from kcgs.compiled import Workspace, borrowed
 from kcgs.compiled.tasks import chunks, phases, run_tasks
-from kcgs.compiled.workspace import Workspace, borrowed
 from kcgs.maps import Membership
 
 from ..coarse_grids import make_blocks, max_spacing
@@ -29,7 +29,7 @@ from .simd import SIDE
 # Gaussians that one task lists, at least, and tasks at most
 _PART = 128
 _MOST_PARTS = 16
-# Gaussians to measure, and pairs to list and to visit, that are worth waking a thread for
+# Gaussians to measure, and pairs to list and to visit, for which another thread is woken
 _THREAD_GAUSSIANS = 2048
 _THREAD_LISTED_PAIRS = 3000
 _THREAD_PAIRS = 300
