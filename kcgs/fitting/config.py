@@ -21,6 +21,8 @@ from kcgs.optim import Event
 
 ObjectiveName = Literal["auto", "psnr", "ms-ssim"]
 _USUAL_ITERATIONS = 700
+# settings that take more than names
+_OWN = {"densify": "an event", "objective": "a function", "optimizer": "a function"}
 
 
 class FitConfig(BaseModel):
@@ -182,4 +184,7 @@ def _first(error: ValidationError) -> Exception:
         return ValueError(f"unknown setting {name!r}: {hint}")
     if detail["type"] == "value_error":
         return cast(Exception, detail["ctx"]["error"])
-    return InvalidArgument(name, detail["msg"].removeprefix("Input should be "), repr(detail["input"]))
+    expected = detail["msg"].removeprefix("Input should be ")
+    if detail["type"] == "literal_error" and name in _OWN:
+        expected += f", or {_OWN[name]} of your own"
+    return InvalidArgument(name, expected, repr(detail["input"]))

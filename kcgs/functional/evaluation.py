@@ -30,7 +30,7 @@ def plan_splat(arguments: SplatArguments, check: bool = True) -> Plan:
     """Prepare Gaussians and map for the kernel that the backend names, with `check` of values."""
     inputs, kernel = _prepare(arguments, check)
     content = kernel.plan(inputs)
-    if content is None:
+    if content is None and kernel.checks_values:
         check_values(*arguments[:3])
     if kernel.looks_up_regions and (content is None or (check and content.foreign)):
         _look_up(inputs, True)

@@ -77,7 +77,7 @@ class TestLoss:
                 {"image": None, "objective": "psnr", "size": (32, 40)},
                 "image must be given, unless objective is a loss of your own; got None",
             ),
-            ({"objective": "l1"}, "objective must be 'auto', 'psnr' or 'ms-ssim'; got 'l1'"),
+            ({"objective": "l1"}, "objective must be 'auto', 'psnr' or 'ms-ssim', or a function of your own; got 'l1'"),
         ],
     )
     def test_bad_arguments(self, change: dict[str, Any], words: str) -> None:
