@@ -131,9 +131,9 @@ def test_cpu_agrees(size: tuple[int, int], batch: int, maps: int, softness: floa
 
 
 def has_nodes(inputs: SplatInputs) -> bool:
-    lists = cpu.plan(inputs)
-    assert lists is not None
-    return bool(lists.live.any())
+    plan = cpu.plan(inputs)
+    assert plan is not None
+    return bool(plan.lists.live.any())
 
 
 def test_one_gaussian_of_each_level() -> None:
