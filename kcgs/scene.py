@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+import kcgs
 from kcgs._atomic import atomic_path
 from kcgs._check import check_size
 from kcgs._memory import check_memory
@@ -138,9 +139,7 @@ class Scene(nn.Module):
 
     def save(self, path: str | os.PathLike[str]) -> int:
         """Write the scene, as :func:`kcgs.save` does; return the bytes of the file."""
-        from kcgs.files import save
-
-        return save(path, self)
+        return kcgs.save(path, self)
 
     def to_onnx(self, path: str | os.PathLike[str], **options: Any) -> onnx.ModelProto:
         """Write the ONNX graph that renders the scene at any size, as Kornia's modules do, and return it.
@@ -161,12 +160,10 @@ class Scene(nn.Module):
             >>> [node.name for node in model.graph.output]
             ['image']
         """
-        from kcgs.onnx import scene_decoder
-
         path = Path(path)
         if path.suffix != ".onnx":
             raise ValueError(f"path must end in .onnx; got {str(path)!r}")
-        model = scene_decoder(self, **options)
+        model: onnx.ModelProto = kcgs.onnx.scene_decoder(self, **options)
         with atomic_path(path) as temporary:
             temporary.write_bytes(model.SerializeToString())
         return model

@@ -13,7 +13,7 @@ from kcgs.compiled.workspace import Workspace
 
 @pytest.fixture(autouse=True)
 def empty_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workspace, "_thread", threading.local())
+    monkeypatch.setattr(workspace, "_thread", workspace.Thread())
 
 
 def address_of(array: np.ndarray) -> int:
