@@ -5,7 +5,7 @@ To add one, write in the module that calls it:
 1. `program = Program("what the log calls it")`;
 2. `@program.entry` above a function that Python calls, with arrays in C order, numbers and named tuples of both;
 3. `@inner` above a function that only compiled functions call, `@inline` where it is small and called often,
-   `@part` where it is large and called once.
+   `@inline_once` where it is large and called once.
 
 Where the module's text changes, or that of a module of kcgs that it imports at its top, its functions compile anew.
 """
@@ -48,7 +48,9 @@ inner = cast(Any, numba.njit)(no_cpython_wrapper=True, no_cfunc_wrapper=True, er
 inline = cast(Any, numba.njit)(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", forceinline=True)
 
 # of one caller, and part of its code from the first: compiled once, not alone and then again with it
-part = cast(Any, numba.njit)(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", inline="always")
+inline_once = cast(Any, numba.njit)(
+    no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", inline="always"
+)
 
 
 class Program:

@@ -10,11 +10,11 @@ from kcgs.compiled import threads_for_kernels
 from kcgs.functional import RegionMap, region_splat
 from kcgs.nn import GaussianField, join
 from kcgs.optim import (
-    Canvas,
     End,
     FieldDescent,
     GaussianAdam,
     Gaussians,
+    Renderer,
     SquaredError,
     cosine_decay,
     count_iterations,
@@ -87,7 +87,7 @@ def _fringe(mask: Tensor, labels: Tensor) -> Tensor:
 
 def _share_in(field: GaussianField, regions: RegionMap, hole: Tensor) -> Tensor:
     """Return the share of the weight of each Gaussian that is in the hole, (N,)."""
-    total, sums = Canvas(field.size, regions, _CUTOFF).weight_sums(Gaussians.of(field))
+    total, sums = Renderer(field.size, regions, _CUTOFF).weight_sums(Gaussians.of(field))
     return sums(hole.to(total)[None]) / sums(torch.ones_like(total)).clamp_min(1e-9)
 
 
@@ -111,7 +111,7 @@ def _fit(field: GaussianField, regions: RegionMap, target: Tensor, weight: Tenso
     # tensors, so that the schedule, too, is in the precision of the field
     rate, color_rate = field.means.detach().new_tensor([_RATE, _COLOR_RATE])
     optimizer = GaussianAdam(field, rate, color_lr=color_rate)
-    canvas = Canvas(field.size, regions, _CUTOFF)
-    descent = FieldDescent(field, optimizer, SquaredError(target, weight), canvas)
+    renderer = Renderer(field.size, regions, _CUTOFF)
+    descent = FieldDescent(field, optimizer, SquaredError(target, weight), renderer)
     run(descent, count_iterations(descent, _STEPS), [End()], cosine_decay)
     return field

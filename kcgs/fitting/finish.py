@@ -26,8 +26,8 @@ def finish(state: FitState, reason: StopReason, seconds: float) -> FitResult:
     EndDrafts().act(state)
     with torch.no_grad():
         if best_draft is not None:
-            canvas = state.canvas._replace(regions=best_draft.regions)
-            measure(state, best_draft, canvas.render(Gaussians.of(best_draft.field)), seconds)
+            renderer = state.renderer._replace(regions=best_draft.regions)
+            measure(state, best_draft, renderer.render(Gaussians.of(best_draft.field)), seconds)
         if reason != "diverged" and is_finite(state.field):
             remove_gaussians(state, state.num_gaussians - problem.num_gaussians)
             measure(state, state.scene, state.render(), seconds)

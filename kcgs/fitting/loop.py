@@ -22,7 +22,7 @@ from .divergence import StopAtDivergence
 from .events.checkpoint import Checkpoint
 from .events.log import Log
 from .finish import finish
-from .methods import method_of
+from .optimizers import optimizer_kind
 from .problem import Problem, make_problem
 from .report import OnStep, Report
 from .result import FitResult, StopReason
@@ -171,7 +171,7 @@ def _run(
     end = End(until, lambda: "seconds" if clock.seconds() >= max_seconds else "iterations")
     report = Report(state, clock, bar, on_step, store)
     events: list[Event] = [report, end, StopAtDivergence(), *make_schedule(config), Log(clock)]
-    reason = run(state, progress, events, method_of(config).rate)
+    reason = run(state, progress, events, optimizer_kind(config).rate)
     return finish(state, cast(StopReason, reason), clock.seconds())
 
 

@@ -16,7 +16,7 @@ from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap, lookup_regions, region_splat
 from kcgs.kernels import check_backend, takes_triton
 from kcgs.nn import GaussianField
-from kcgs.optim import Canvas, Objective, halve
+from kcgs.optim import Objective, Renderer, halve
 
 from .problem import regions_of
 
@@ -113,10 +113,10 @@ def propose(residual: Tensor, regions: RegionMap | None, count: int, *, backend:
     return GaussianField(means, cholesky, colors, torch.cat(region_ids) if region_ids else None, size=size)
 
 
-def propose_for(objective: Objective, rendered: Tensor, canvas: Canvas, count: int) -> GaussianField:
+def propose_for(objective: Objective, rendered: Tensor, renderer: Renderer, count: int) -> GaussianField:
     """Find at most `count` Gaussians that lower an objective of a render, (C, H, W), most: see `propose`."""
     error, root = objective.residual(rendered)
-    added = propose(error, canvas.regions, count, backend=canvas.backend)
+    added = propose(error, renderer.regions, count, backend=renderer.backend)
     if isinstance(root, Tensor):
         x, y = added.means.detach().long().unbind(-1)
         added.colors.data = added.colors.detach() / root[y, x, None]

@@ -12,7 +12,7 @@ from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.functional import RegionMap
 from kcgs.kernels import check_backend
 from kcgs.nn import GaussianField
-from kcgs.optim import Canvas, Gaussians, draft_cutoff
+from kcgs.optim import Gaussians, Renderer, draft_cutoff
 
 from .problem import regions_of
 from .state import FitState
@@ -59,17 +59,19 @@ def lowest_impact(
     if (map_of_field is None) != (field.region_ids is None):
         raise InvalidArgument("regions", "given where the field has region ids, and only there", regions)
     count = check_count("num_gaussians", num_gaussians, 0, field.num_gaussians)
-    gaussians, canvas = Gaussians.of(field), Canvas(field.size, map_of_field, backend=check_backend(backend))
-    return lowest_weighted_impact(canvas, gaussians, count, torch.ones_like(gaussians.means[:, 0]))
+    gaussians, renderer = Gaussians.of(field), Renderer(field.size, map_of_field, backend=check_backend(backend))
+    return lowest_weighted_impact(renderer, gaussians, count, torch.ones_like(gaussians.means[:, 0]))
 
 
 @torch.no_grad()
-def lowest_weighted_impact(canvas: Canvas, gaussians: Gaussians, count: int, weight: Tensor) -> tuple[Tensor, Tensor]:
+def lowest_weighted_impact(
+    renderer: Renderer, gaussians: Gaussians, count: int, weight: Tensor
+) -> tuple[Tensor, Tensor]:
     """Do what `lowest_impact` does, by a weight of the squared error of each Gaussian, (N,)."""
     _, cholesky, colors, _ = gaussians
 
     def products(cholesky: Tensor, colors: Tensor) -> Tensor:
-        return canvas.inner_products(gaussians._replace(cholesky=cholesky, colors=colors))
+        return renderer.inner_products(gaussians._replace(cholesky=cholesky, colors=colors))
 
     area = math.pi * cholesky[:, :1] * cholesky[:, 2:]
     energy = weight * colors.square().sum(1) * area[:, 0]
@@ -94,7 +96,7 @@ def remove_gaussians(state: FitState, count: int) -> None:
     if count <= 0:
         return
     gaussians, cutoff = Gaussians.of(state.field), draft_cutoff(state.problem.config.cutoff)
-    canvas, weight = state.canvas._replace(cutoff=cutoff), state.objective.weigh(gaussians)
-    removed, colors = lowest_weighted_impact(canvas, gaussians, count, weight)
+    renderer, weight = state.renderer._replace(cutoff=cutoff), state.objective.weigh(gaussians)
+    removed, colors = lowest_weighted_impact(renderer, gaussians, count, weight)
     state.field.colors.data.copy_(colors)
     state.optimizer.keep(state.field, ~removed)

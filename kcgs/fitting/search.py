@@ -18,7 +18,7 @@ from kcgs.functional import psnr
 
 from .clock import Clock
 from .events import Densify
-from .methods import method_of
+from .optimizers import optimizer_kind
 from .problem import Problem
 from .removal import remove_gaussians
 from .result import FitResult
@@ -86,7 +86,7 @@ def _fit(problem: Problem, count: int, trials: list[_Trial], seconds: float, run
         nearest is None
         or nearest.result.stop_reason == "diverged"
         or not isinstance(densify, Densify)
-        or not method_of(config).has_drafts
+        or not optimizer_kind(config).has_drafts
     ):
         state = start(problem)
     else:

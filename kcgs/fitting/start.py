@@ -10,11 +10,11 @@ from torch import Tensor
 from kcgs.functional import RegionMap, choose_softness
 from kcgs.maps import pairs_to_merge
 from kcgs.nn import GaussianField
-from kcgs.optim import Canvas, draft_cutoff
+from kcgs.optim import Renderer, draft_cutoff
 
 from .config import FitConfig
 from .initial import initial_sigma, random_field, uniform_field
-from .methods import method_of
+from .optimizers import optimizer_kind
 from .problem import Problem
 from .published.gradient_start import gradient_field
 from .state import FitState
@@ -38,13 +38,13 @@ def make_state(
     problem: Problem, field: GaussianField, regions: RegionMap | None, num_initial: int, **progress: Any
 ) -> FitState:
     """Return the state of a fit of a field that began with so many Gaussians."""
-    config, method = problem.config, method_of(problem.config)
-    cutoff = draft_cutoff(config.cutoff) if method.has_drafts else config.cutoff
+    config, optimizer = problem.config, optimizer_kind(problem.config)
+    cutoff = draft_cutoff(config.cutoff) if optimizer.has_drafts else config.cutoff
     return FitState(
         field,
-        method.make_optimizer(config, field, initial_sigma(problem.size, num_initial)),
+        optimizer.make_optimizer(config, field, initial_sigma(problem.size, num_initial)),
         problem.objective,
-        Canvas(problem.size, regions, cutoff, config.backend, problem.bounds),
+        Renderer(problem.size, regions, cutoff, config.backend, problem.bounds),
         problem=problem,
         num_initial=num_initial,
         **{"num_requested": num_initial, **progress},

@@ -79,7 +79,7 @@ class FitState(FieldDescent):
     @property
     def is_draft(self) -> bool:
         """True where the cutoff is not yet that of the result."""
-        return self.canvas.cutoff != self.problem.config.cutoff
+        return self.renderer.cutoff != self.problem.config.cutoff
 
     @property
     def runs_ahead(self) -> bool:
@@ -108,7 +108,7 @@ class FitState(FieldDescent):
         return self.lacks_room or len(content) != len(self._stepped) or any(map(is_not, content, self._stepped))
 
     def _content(self) -> list[object]:
-        return [self.field.means, self.field.cholesky, self.field.colors, self.field.region_ids, self.canvas]
+        return [self.field.means, self.field.cholesky, self.field.colors, self.field.region_ids, self.renderer]
 
     @property
     def is_settled(self) -> bool:
@@ -118,7 +118,7 @@ class FitState(FieldDescent):
     @property
     def replays(self) -> bool:
         """True where the next step is a kernel's programs alone, on a GPU, which a CUDA graph replays."""
-        return self.is_settled and self.field.means.is_cuda and self.objective.has_fused_gradients(self.canvas)
+        return self.is_settled and self.field.means.is_cuda and self.objective.has_fused_gradients(self.renderer)
 
     @contextmanager
     def running_ahead(self) -> Iterator[None]:

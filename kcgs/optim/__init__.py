@@ -2,11 +2,11 @@
 
 from .descent import FieldDescent
 from .gaussian_adam import COLOR_LEARNING_RATE, LEARNING_RATE, GaussianAdam, is_within
-from .gaussians import Canvas, Gaussians, draft_cutoff
+from .gaussians import Gaussians, Renderer, draft_cutoff
 from .ms_ssim import MsSsim, halve
 from .newton import NewtonDescent, self_product
 from .objectives import AbsoluteError, LossObjective, Objective, SquaredError
-from .run import At, End, Event, cosine_decay, count_iterations, run
+from .run import End, Event, TimedAction, cosine_decay, count_iterations, run
 
 # public; what else is imported here is for the other rooms of kcgs
 __all__ = ["GaussianAdam"]

@@ -10,7 +10,7 @@ from torch import Tensor
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 
-from .gaussians import Canvas, Gaussians
+from .gaussians import Gaussians, Renderer
 from .objectives import Objective
 
 
@@ -22,7 +22,7 @@ class FieldDescent:
     optimizer: Any
     """A GaussianAdam, or what has its `param_groups`, `step`, `append`, `keep`, `state_dict` and `load_state_dict`."""
     objective: Objective
-    canvas: Canvas
+    renderer: Renderer
     iteration: int = 0
     progress: float = 0.0
     rendered: Tensor | None = None
@@ -40,15 +40,15 @@ class FieldDescent:
     @property
     def regions(self) -> RegionMap | None:
         """The map that Gaussians are confined by."""
-        return self.canvas.regions
+        return self.renderer.regions
 
     @regions.setter
     def regions(self, regions: RegionMap | None) -> None:
-        self.canvas = self.canvas._replace(regions=regions)
+        self.renderer = self.renderer._replace(regions=regions)
 
     def render(self) -> Tensor:
         """Render (C, H, W), with a graph."""
-        return self.canvas.render(self.gaussians)
+        return self.renderer.render(self.gaussians)
 
     def step(self, rate: float) -> None:
         """Move the field once, and count the iteration."""
@@ -60,6 +60,6 @@ class FieldDescent:
     def move(self) -> None:
         """Take a step of the optimizer by the gradients of the objective; colours are without opacities."""
         field, rendered, self.rendered = self.field, self.rendered, None
-        gradients = self.objective.gradients(self.canvas, self.gaussians, rendered)
+        gradients = self.objective.gradients(self.renderer, self.gaussians, rendered)
         field.means.grad, field.cholesky.grad, field.colors.grad = gradients[:3]
         self.optimizer.step()

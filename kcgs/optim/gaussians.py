@@ -1,4 +1,4 @@
-"""Gaussians as plain tensors, and what they are rendered with."""
+"""Gaussians as plain tensors, and their renderer."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ class Gaussians(NamedTuple):
         return Gaussians(means, cholesky, colors, self.region_ids)
 
 
-class Canvas(NamedTuple):
-    """What Gaussians are rendered with."""
+class Renderer(NamedTuple):
+    """Renders Gaussians of one image, with one map, cutoff and backend."""
 
     size: tuple[int, int]
     regions: RegionMap | None = None

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from .frame import local_gradient, move, widen
-from .gaussians import Canvas, Gaussians
+from .gaussians import Gaussians, Renderer
 from .objectives import Objective
 
 # half the second derivatives of the squared error by a step in a Gaussian's frame, per energy of the Gaussian: two of
@@ -34,15 +34,21 @@ class NewtonDescent:
     Args:
         gaussians: the start.
         objective: about quadratic.
-        canvas: what they are rendered with.
+        renderer: of these Gaussians.
         exact: see :func:`kcgs.optim.frame.move`.
         min_sigma: least standard deviation of a Gaussian after a step, in pixels.
     """
 
     def __init__(
-        self, gaussians: Gaussians, objective: Objective, canvas: Canvas, *, exact: bool = True, min_sigma: float = 0.0
+        self,
+        gaussians: Gaussians,
+        objective: Objective,
+        renderer: Renderer,
+        *,
+        exact: bool = True,
+        min_sigma: float = 0.0,
     ) -> None:
-        self.gaussians, self.objective, self.canvas = gaussians, objective, canvas
+        self.gaussians, self.objective, self.renderer = gaussians, objective, renderer
         self.exact, self.min_sigma = exact, min_sigma
         self.velocity = torch.zeros_like(torch.cat(gaussians[:3], -1))  # [N, 5 + C]
         self.frozen: Tensor | None = None  # numbers that do not move, bool, (N, 5 + C) or what broadcasts to it
@@ -63,7 +69,7 @@ class NewtonDescent:
 
     def half_gradients(self) -> Gaussians:
         """Return half the gradients of the objective."""
-        return self.objective.gradients(self.canvas, self.gaussians)
+        return self.objective.gradients(self.renderer, self.gaussians)
 
     def color_curvature(self) -> Tensor:
         """Return half the second derivative of the objective by a colour, (N,)."""

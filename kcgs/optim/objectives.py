@@ -12,7 +12,7 @@ from torch.nn.functional import l1_loss, mse_loss
 
 from kcgs.errors import InvalidArgument
 
-from .gaussians import Canvas, Gaussians
+from .gaussians import Gaussians, Renderer
 
 Loss = Callable[[Tensor], Tensor]
 
@@ -59,17 +59,17 @@ class Objective(ABC):
         """Return what a render, (C, H, W), lacks."""
         return Residual(self.image - render)
 
-    def has_fused_gradients(self, canvas: Canvas) -> bool:
+    def has_fused_gradients(self, renderer: Renderer) -> bool:
         """Whether gradients need no render of their own."""
         return False
 
-    def gradients(self, canvas: Canvas, gaussians: Gaussians, render: Tensor | None = None) -> Gaussians:
+    def gradients(self, renderer: Renderer, gaussians: Gaussians, render: Tensor | None = None) -> Gaussians:
         """Return half the gradients by Gaussians; a render with a graph to them may be given."""
         leaves = gaussians
         if render is None:
             leaves = gaussians.map(lambda table: table.detach().requires_grad_())
             with torch.enable_grad():
-                render = canvas.render(leaves)
+                render = renderer.render(leaves)
         # `data`: the slope may overwrite it, which the graph does not mind
         return Gaussians(*torch.autograd.grad(render, leaves[:3], self.slope(render.data)))
 
@@ -92,15 +92,15 @@ class SquaredError(Objective):
             return mse_loss(render, self.image)
         return (self.weight * (render - self.image).square()).mean()
 
-    def has_fused_gradients(self, canvas: Canvas) -> bool:
+    def has_fused_gradients(self, renderer: Renderer) -> bool:
         """Whether the error is that of all pixels of the render as it is."""
-        return self.weight is None and canvas.bounds is None
+        return self.weight is None and renderer.bounds is None
 
-    def gradients(self, canvas: Canvas, gaussians: Gaussians, render: Tensor | None = None) -> Gaussians:
+    def gradients(self, renderer: Renderer, gaussians: Gaussians, render: Tensor | None = None) -> Gaussians:
         """Render and differentiate at once, where that is possible."""
-        if render is None and self.has_fused_gradients(canvas):
-            return canvas.squared_error_gradients(gaussians, self.image)
-        return super().gradients(canvas, gaussians, render)
+        if render is None and self.has_fused_gradients(renderer):
+            return renderer.squared_error_gradients(gaussians, self.image)
+        return super().gradients(renderer, gaussians, render)
 
 
 class AbsoluteError(Objective):

@@ -73,7 +73,7 @@ class End:
         return self.reason()
 
 
-class At:
+class TimedAction:
     """Acts once at each of some shares of a descent, which ascend."""
 
     def __init__(self, times: Iterable[float], action: Callable[[], None]) -> None:

@@ -17,7 +17,7 @@ from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
 from kcgs.fitting import ObjectiveName
 from kcgs.functional import psnr
-from kcgs.optim import At, End, MsSsim, Objective, SquaredError, count_iterations, run
+from kcgs.optim import End, MsSsim, Objective, SquaredError, TimedAction, count_iterations, run
 from kcgs.scene import Scene
 
 from .descent import RATE, RateDistortionDescent
@@ -248,7 +248,7 @@ class Compressor:
 
         progress = count_iterations(descent, iterations)
         times = [k / iterations for k in range(0, iterations, _SCHEDULE.update_interval)]
-        run(descent, progress, [End(), At(times, update)], lambda progress: RATE)
+        run(descent, progress, [End(), TimedAction(times, update)], lambda progress: RATE)
         return writer.with_gaussians(descent.parameters(), descent.ids) if iterations else writer, qp
 
     def _round(self, writer: SceneWriter, qp: int, iterations: int, max_bytes: float = math.inf) -> bytes:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs.codec import Parameters, Quantizer, SceneWriter
-from kcgs.optim import Canvas, Gaussians, NewtonDescent, Objective, self_product
+from kcgs.optim import Gaussians, NewtonDescent, Objective, Renderer, self_product
 
 from .bits import soft_bits
 
@@ -48,9 +48,9 @@ class RateDistortionDescent(NewtonDescent):
         self._scale = Gaussians(scale, scale[[0, 1, 1]], torch.ones_like(scale[:1]))
         self._num_pixels, self.ids = height * width, writer.ids
         gaussians = self._as_tensors(writer.gaussians, image)
-        canvas = Canvas(size, writer.regions)
+        renderer = Renderer(size, writer.regions)
         # steps are so short that the first order of the shear is enough
-        super().__init__(gaussians, objective, canvas, exact=False, min_sigma=min_sigma)
+        super().__init__(gaussians, objective, renderer, exact=False, min_sigma=min_sigma)
         self._error_weights = self._weigh(self.gaussians)
         self._error_scale = float(self._error_weights.mean())
         self._bit_gradient: Gaussians | None = None
@@ -110,10 +110,10 @@ class RateDistortionDescent(NewtonDescent):
         if self._bit_gradient is None or self.iteration % _REUSE_STEPS == 0:
             self._bit_gradient = self._half_bit_gradient()
             self._error_weights = self._weigh(self.gaussians)
-        ids = None if self.canvas.regions is None else self.canvas.regions.ids[torch.from_numpy(self.ids)]
-        gradients = self.objective.gradients(self.canvas, self._scaled(self.gaussians)._replace(region_ids=ids))
+        ids = None if self.renderer.regions is None else self.renderer.regions.ids[torch.from_numpy(self.ids)]
+        gradients = self.objective.gradients(self.renderer, self._scaled(self.gaussians)._replace(region_ids=ids))
         # a pixel of the image stands for so many of the photo
-        pixels = self._num_pixels / (self.canvas.size[0] * self.canvas.size[1])
+        pixels = self._num_pixels / (self.renderer.size[0] * self.renderer.size[1])
         scaled = self._scaled(gradients.map(lambda gradient: pixels * gradient))
         return scaled.map(torch.add, self._bit_gradient)
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 
 from kcgs.codec import Classes, Codes
-from kcgs.optim import At, End, count_iterations, run
+from kcgs.optim import End, TimedAction, count_iterations, run
 
 from .descent import RATE, RateDistortionDescent
 
@@ -45,7 +45,7 @@ def round_gradually(
         max_bytes: largest size of the file, unless one Gaussian alone takes more.
     """
     rounding = _Rounding(descent, write, seed, max_bytes)
-    groups = At([k / iterations for k in range(0, iterations, _GROUP_INTERVAL)], rounding.round_group)
+    groups = TimedAction([k / iterations for k in range(0, iterations, _GROUP_INTERVAL)], rounding.round_group)
     run(descent, count_iterations(descent, iterations), [End(), groups], lambda progress: RATE)
     while len(data := write(rounding.codes())) > max_bytes and len(descent.ids) > 1:
         rounding.remove_excess(len(data))

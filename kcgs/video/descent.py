@@ -11,14 +11,14 @@ from torch import Tensor
 from kcgs.fitting import FitConfig, lowest_weighted_impact, move_contours, propose_for
 from kcgs.functional import RegionMap
 from kcgs.optim import (
-    At,
-    Canvas,
     End,
     Event,
     Gaussians,
     MsSsim,
     NewtonDescent,
+    Renderer,
     SquaredError,
+    TimedAction,
     count_iterations,
     draft_cutoff,
     run,
@@ -46,9 +46,9 @@ _FIXED_WEIGHT = 1e9
 _USUAL_OVERLAP = 12.0
 
 
-def canvas_of(scene: Scene, config: FitConfig) -> Canvas:
+def renderer_of(scene: Scene, config: FitConfig) -> Renderer:
     """Return what the frames of a fit are rendered with: the map of one, and the cutoff of a draft."""
-    return Canvas(scene.size, scene.regions, draft_cutoff(config.cutoff), config.backend)
+    return Renderer(scene.size, scene.regions, draft_cutoff(config.cutoff), config.backend)
 
 
 class FrameDescent(NewtonDescent):
@@ -68,7 +68,7 @@ class FrameDescent(NewtonDescent):
         self, image: Tensor, scene: Scene, config: FitConfig, movable_rows: Tensor, changed_pixels: Tensor
     ) -> None:
         objective = MsSsim(image) if config.objective == "ms-ssim" else SquaredError(image)
-        super().__init__(Gaussians.of(scene.field), objective, canvas_of(scene, config), min_sigma=_MIN_SIGMA)
+        super().__init__(Gaussians.of(scene.field), objective, renderer_of(scene, config), min_sigma=_MIN_SIGMA)
         self.image, self.start, self.config = image, scene, config
         self.movable_rows, self.changed_pixels = movable_rows, changed_pixels
         self.overlap = torch.ones_like(self.gaussians.means[:, 0])
@@ -76,7 +76,7 @@ class FrameDescent(NewtonDescent):
     @property
     def scene(self) -> Scene:
         """The Gaussians and the map at the moment."""
-        return Scene(self.gaussians.field(self.canvas.size), self.canvas.regions)
+        return Scene(self.gaussians.field(self.renderer.size), self.renderer.regions)
 
     def run(self, relocations: Mapping[int, float], anchor: Tensor | None = None) -> Scene:
         """Return the scene after the descent, or the start if its error is lower.
@@ -88,17 +88,17 @@ class FrameDescent(NewtonDescent):
         before = self.squared_error()
         events: list[Event] = [
             End(),
-            *(At([k / _ITERATIONS], partial(self._relocate, s)) for k, s in relocations.items()),
+            *(TimedAction([k / _ITERATIONS], partial(self._relocate, s)) for k, s in relocations.items()),
         ]
         if anchor is not None:
-            events.append(At([_CONTOUR_ITERATION / _ITERATIONS], partial(self._move_contours, anchor)))
+            events.append(TimedAction([_CONTOUR_ITERATION / _ITERATIONS], partial(self._move_contours, anchor)))
         final = (_ITERATIONS - _FINAL_ITERATIONS) / _ITERATIONS
         run(self, count_iterations(self, _ITERATIONS), events, lambda p: _RATE if p < final else 0.5 * _RATE)
         return self.scene if self.squared_error() <= before else self.start
 
     def squared_error(self) -> float:
         """Return the mean squared error."""
-        return float(self.canvas.squared_error(self.gaussians, self.image).mean())
+        return float(self.renderer.squared_error(self.gaussians, self.image).mean())
 
     def step(self, rate: float) -> None:
         """Move the movable rows once."""
@@ -114,18 +114,18 @@ class FrameDescent(NewtonDescent):
 
         Rows that lower it nowhere get the colour 0.
         """
-        gaussians, canvas = self.gaussians, self.canvas
+        gaussians, renderer = self.gaussians, self.renderer
         count = round(share * int(self.movable_rows.sum()))
         visibility, self.overlap = self._overlap()
         weights = self.objective.weigh(gaussians) * visibility
         weights = torch.where(self.movable_rows, weights, _FIXED_WEIGHT)
-        mask, new_colors = lowest_weighted_impact(canvas, gaussians, count, weights)
+        mask, new_colors = lowest_weighted_impact(renderer, gaussians, count, weights)
         colors = torch.where(self.movable_rows[:, None], new_colors, gaussians.colors)
         gaussians = gaussians._replace(colors=colors.masked_fill(mask[:, None], 0.0))
         self.velocity[mask], self.movable_rows = 0.0, self.movable_rows | mask
 
-        rendered = torch.where(self.changed_pixels, canvas.render(gaussians), self.image)
-        added = Gaussians.of(propose_for(self.objective, rendered, canvas, int(mask.sum())))
+        rendered = torch.where(self.changed_pixels, renderer.render(gaussians), self.image)
+        added = Gaussians.of(propose_for(self.objective, rendered, renderer, int(mask.sum())))
         rows = mask.nonzero()[: len(added.means), 0]
         self.gaussians = gaussians.map(lambda numbers, new: numbers.index_copy(0, rows, new), added)
         if gaussians.region_ids is not None and added.region_ids is not None:
@@ -137,7 +137,7 @@ class FrameDescent(NewtonDescent):
 
         Gaussians in one place move together: with the second derivative of one alone, their steps would be too long.
         """
-        total, sums = self.canvas.weight_sums(self.gaussians)
+        total, sums = self.renderer.weight_sums(self.gaussians)
         areas = self_product(self.gaussians.cholesky)
         visibility = (sums(torch.ones_like(total)) / (2 * areas)).clamp_max(1.0)
         return visibility, (sums(total) / areas / _USUAL_OVERLAP).clamp_min(1.0)
@@ -146,7 +146,7 @@ class FrameDescent(NewtonDescent):
         """Move contours to where the error is lower, or little higher."""
 
         def squared_error(regions: RegionMap) -> Tensor:
-            return self.canvas._replace(regions=regions).squared_error(self.gaussians, self.image)
+            return self.renderer._replace(regions=regions).squared_error(self.gaussians, self.image)
 
         regions = move_contours(self.scene, self.image, anchor, self.config, squared_error, _MAX_RISE)
-        self.canvas = self.canvas._replace(regions=regions)
+        self.renderer = self.renderer._replace(regions=regions)

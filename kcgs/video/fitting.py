@@ -23,7 +23,7 @@ from kcgs.nn import GaussianField
 from kcgs.optim import Gaussians
 from kcgs.scene import Scene
 
-from .descent import FrameDescent, canvas_of
+from .descent import FrameDescent, renderer_of
 from .files import DEFAULT_FRAME_RATE
 from .flow import move_labels, move_points, optical_flow
 from .stacking import stack
@@ -141,7 +141,7 @@ class _VideoFit:
 
     def _squared_error(self, scene: Scene) -> Tensor:
         """Return the squared error of each pixel, (H, W)."""
-        return canvas_of(scene, self.config).squared_error(Gaussians.of(scene.field), self.image)
+        return renderer_of(scene, self.config).squared_error(Gaussians.of(scene.field), self.image)
 
     def _fit_anew(self, regions: RegionMap | None) -> Scene:
         """Fit a frame by itself; rows that it leaves unused have colour 0."""
@@ -188,13 +188,13 @@ class _VideoFit:
             region_ids = torch.where(is_present, region_ids, regions.ids[0])
             colors = torch.where(is_present[:, None], colors, 0.0)
         still = Gaussians(means, cholesky, colors, region_ids)
-        canvas = canvas_of(self.frames[-1], self.config)._replace(regions=regions)
-        error = canvas.squared_error(still, self.image)
+        renderer = renderer_of(self.frames[-1], self.config)._replace(regions=regions)
+        error = renderer.squared_error(still, self.image)
         changed_pixels = _local_mean(error) > _MAX_GROWTH * _local_mean(self.error) + _LEVEL
-        _, sums = canvas.weight_sums(still)
+        _, sums = renderer.weight_sums(still)
         movable_rows = sums(changed_pixels[None].to(flow)) >= _MOVABLE_SHARE * sums(torch.ones_like(flow[:1]))
         means = torch.where(movable_rows[:, None], _move_means(flow, still, regions), means)
-        moved = still._replace(means=means).field(canvas.size)
+        moved = still._replace(means=means).field(renderer.size)
         return Scene(moved, regions), movable_rows, changed_pixels
 
 

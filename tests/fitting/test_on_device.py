@@ -24,7 +24,7 @@ from kcgs.functional import PairSoftness, contour_fit
 from kcgs.kernels.cuda.capacity import reports
 from kcgs.optim import gaussian_adam
 from kcgs.optim.descent import FieldDescent
-from kcgs.optim.gaussians import Canvas
+from kcgs.optim.gaussians import Renderer
 
 from .absent_device import AbsentDevice, DeviceTensor
 
@@ -102,7 +102,7 @@ def test_a_late_log_is_the_log(ahead: pytest.MonkeyPatch) -> None:
 
 def test_nothing_moves_where_a_step_had_no_room(ahead: pytest.MonkeyPatch) -> None:
     """Its gradients and its render are NaN; the history lacks it, and the next steps get more room."""
-    gradients, render, calls, settled = Canvas.squared_error_gradients, FitState.render, [], []
+    gradients, render, calls, settled = Renderer.squared_error_gradients, FitState.render, [], []
 
     def missed(function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*arguments: Any, **settings: Any) -> Any:
@@ -116,7 +116,7 @@ def test_nothing_moves_where_a_step_had_no_room(ahead: pytest.MonkeyPatch) -> No
 
     ahead.setattr(state, "settle", lambda device, size: settled.append(size))
     whole, num_events = run(), len(settled)
-    ahead.setattr(Canvas, "squared_error_gradients", missed(gradients))
+    ahead.setattr(Renderer, "squared_error_gradients", missed(gradients))
     ahead.setattr(FitState, "render", missed(render))
     result = run()
     num_misses = len(settled) - 2 * num_events
@@ -196,7 +196,7 @@ READS = ["item", "tolist", "numpy", "cpu", "__bool__", "__float__", "__int__", "
 def test_a_step_reads_no_value_and_takes_few_operations(ahead: pytest.MonkeyPatch) -> None:
     """Besides the kernel's: see its own test. A render that is checked belongs to a log or to an event."""
     counter, steps, checked = Counter(), [], set()
-    for owner, name in ((Canvas, "squared_error_gradients"), (gaussian_adam, "_launch")):
+    for owner, name in ((Renderer, "squared_error_gradients"), (gaussian_adam, "_launch")):
         ahead.setattr(owner, name, counter.paused(getattr(owner, name), name))
     ahead.setattr(gaussian_adam, "takes_triton", lambda *tensors: True)
     ahead.setattr(gaussian_adam, "_launch", lambda *arguments: counter.operations.append("_launch"))

@@ -9,7 +9,7 @@ from torch import Tensor
 from kcgs import RegionMap, fit
 from kcgs.fitting.removal import lowest_weighted_impact
 from kcgs.functional import psnr, region_splat
-from kcgs.optim.gaussians import Canvas, Gaussians
+from kcgs.optim.gaussians import Gaussians, Renderer
 
 SIZE = (40, 60)
 
@@ -31,7 +31,7 @@ class RemovalCase:
         """Return who is removed, the colours of all, and the squared error without and with these colours."""
         weight = torch.ones(len(self.means)) if weight is None else weight
         gaussians = Gaussians(self.means, self.cholesky, self.colors, self.ids)
-        removed, colors = lowest_weighted_impact(Canvas(SIZE, self.regions, 1e-3), gaussians, count, weight)
+        removed, colors = lowest_weighted_impact(Renderer(SIZE, self.regions, 1e-3), gaussians, count, weight)
         image = self.render(self.means, self.cholesky, self.colors)
         errors = [
             float((self.render(self.means, self.cholesky, c * ~removed[:, None]) - image).square().sum())

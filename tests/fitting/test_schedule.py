@@ -12,7 +12,7 @@ import torch
 from kcgs import FitConfig, RegionMap
 from kcgs.fitting.contour_moves import accept_moves
 from kcgs.fitting.events import Densify, SettleContours
-from kcgs.fitting.methods import method_of
+from kcgs.fitting.optimizers import optimizer_kind
 from kcgs.fitting.problem import make_problem
 from kcgs.fitting.result import HistoryEntry
 from kcgs.fitting.schedule import make_schedule
@@ -76,7 +76,7 @@ class TestDensify:
 class TestLearningRates:
     def rates(self, progress: float, factor: float = 1.0, iterations: int = 12_500, **settings: Any) -> list[float]:
         config = FitConfig(learning_rate_factor=factor, iterations=iterations, **settings)
-        method = method_of(config)
+        method = optimizer_kind(config)
         optimizer = method.make_optimizer(config, GaussianField.random(3, (8, 8), seed=0), 2.0)
         return [float(group["lr"]) * method.rate(progress) for group in optimizer.param_groups]
 

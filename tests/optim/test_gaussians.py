@@ -1,4 +1,4 @@
-"""Gaussians on a canvas: sums over pixels, by the weights of each Gaussian."""
+"""Gaussians by a renderer: sums over pixels, by the weights of each Gaussian."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from kcgs import GaussianField, RegionMap
-from kcgs.optim.gaussians import Canvas, Gaussians
+from kcgs.optim.gaussians import Gaussians, Renderer
 
 SIZE = (24, 40)
 
@@ -19,20 +19,20 @@ def test_inner_products_are_those_of_rendered_gaussians(backend: str, softness: 
     field = GaussianField.random(30, SIZE, regions=regions, seed=0)
     gaussians = Gaussians.of(field)
     # a channel for each Gaussian alone
-    weights = Canvas(SIZE, regions, 0.0, "reference").render(gaussians._replace(colors=torch.eye(30)))
+    weights = Renderer(SIZE, regions, 0.0, "reference").render(gaussians._replace(colors=torch.eye(30)))
     expected = (weights.flatten(1) @ weights.flatten(1).T) @ gaussians.colors
-    actual = Canvas(SIZE, regions, 1e-6, backend).inner_products(gaussians)
+    actual = Renderer(SIZE, regions, 1e-6, backend).inner_products(gaussians)
     torch.testing.assert_close(actual, expected, atol=1e-3, rtol=1e-4)
 
 
 @pytest.mark.parametrize("regions", [None, RegionMap.from_labels((torch.arange(40) >= 18).long().expand(SIZE), 0.8)])
 def test_weight_sums_are_those_of_rendered_gaussians(regions: RegionMap | None) -> None:
-    gaussians, canvas = (
+    gaussians, renderer = (
         Gaussians.of(GaussianField.random(30, SIZE, regions=regions, seed=0)),
-        Canvas(SIZE, regions, 1e-6),
+        Renderer(SIZE, regions, 1e-6),
     )
-    weights = canvas.render(gaussians._replace(colors=torch.eye(30)))
-    total, sums = canvas.weight_sums(gaussians)
+    weights = renderer.render(gaussians._replace(colors=torch.eye(30)))
+    total, sums = renderer.weight_sums(gaussians)
     plane = torch.rand(1, *SIZE, generator=torch.Generator().manual_seed(0))
     torch.testing.assert_close(total[0], weights.sum(0), atol=1e-3, rtol=1e-3)
     torch.testing.assert_close(sums(plane), (weights * plane).sum((1, 2)), atol=1e-2, rtol=1e-3)

@@ -87,7 +87,7 @@ def _to_plain(state: FitState) -> dict[str, Any]:
     """Return tensors, numbers, strings, lists and dicts, which load without running code."""
     return {
         **{name: getattr(state, name) for name in _NUMBERS},
-        "cutoff": state.canvas.cutoff,
+        "cutoff": state.renderer.cutoff,
         "scene": _scene_to_plain(state.scene),
         "best": None if state.best is None else _scene_to_plain(state.best),
         "anchor": None if state.anchor is None else state.anchor.state(),
@@ -105,7 +105,7 @@ def _from_plain(plain: dict[str, Any], problem: Problem) -> FitState:
         best=None if plain["best"] is None else _scene_from_plain(plain["best"], problem.size),
         **{name: plain[name] for name in _NUMBERS},
     )  # fmt: skip
-    state.canvas = state.canvas._replace(cutoff=plain["cutoff"])
+    state.renderer = state.renderer._replace(cutoff=plain["cutoff"])
     state.optimizer.load_state_dict(plain["optimizer"])
     return state
 

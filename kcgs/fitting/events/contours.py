@@ -42,12 +42,12 @@ class AdaptContours:
 
 def _move_contours(state: FitState, max_rise: float) -> None:
     """Move the contours where that raises the squared error about them by no more than a factor."""
-    problem, gaussians, canvas = state.problem, state.gaussians, state.canvas
+    problem, gaussians, renderer = state.problem, state.gaussians, state.renderer
     if state.regions is None or state.anchor is None or not problem.has_image:
         return
 
     def squared_error(regions: RegionMap) -> Tensor:
-        return canvas._replace(regions=regions).squared_error(gaussians, problem.image)
+        return renderer._replace(regions=regions).squared_error(gaussians, problem.image)
 
     anchor = state.anchor.labels
     state.regions = move_contours(state.scene, problem.image, anchor, problem.config, squared_error, max_rise)

@@ -101,4 +101,4 @@ class Densify:
 
     def propose(self, state: FitState, count: int) -> GaussianField:
         """Return the Gaussians to add."""
-        return propose_for(state.objective, state.render().detach(), state.canvas, count)
+        return propose_for(state.objective, state.render().detach(), state.renderer, count)

@@ -25,5 +25,5 @@ class EndDrafts:
         """Set the cutoff; the next state that is measured is the best, since drafts do not compare with it."""
         if state.is_draft:
             collect_measurements(state, wait=True)
-            state.canvas = state.canvas._replace(cutoff=state.problem.config.cutoff)
+            state.renderer = state.renderer._replace(cutoff=state.problem.config.cutoff)
             state.best_value = math.inf

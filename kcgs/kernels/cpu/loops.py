@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from kcgs.compiled.program import inner, part
+from kcgs.compiled.program import inline_once, inner
 from kcgs.compiled.tasks import first_task, next_task
 
 from .gradients import sum_terms
@@ -69,7 +69,7 @@ def _clear(lists, grid, size, first, end):  # type: ignore[no-untyped-def]
             grid[block * size : (block + 1) * size] = 0.0
 
 
-@part
+@inline_once
 def _visit_row(lists, task, image, pixels, nodes, slopes, terms, sums, offsets, ones):  # type: ignore[no-untyped-def]
     """Visit a row of blocks: add, gather, or both."""
     table, live, start, pairs = lists.table, lists.live, lists.start, lists.pairs

@@ -13,7 +13,7 @@ from .published.gaussian_image import GaussianImageAdan
 from .published.image_gs import ImageGSAdam
 
 
-class Method(NamedTuple):
+class OptimizerKind(NamedTuple):
     """An optimizer, and how a fit uses it."""
 
     make_optimizer: Callable[[FitConfig, GaussianField, float], Any]
@@ -24,10 +24,12 @@ class Method(NamedTuple):
     """True where most of the fit has a larger cutoff, and its state may go on with other Gaussians."""
 
 
-def method_of(config: FitConfig) -> Method:
-    """Return the method of the settings; one of the user's own makes an optimizer of a field."""
+def optimizer_kind(config: FitConfig) -> OptimizerKind:
+    """Return the kind that the settings name, or one around a user's function from a field to an optimizer."""
     make = config.optimizer
-    return Method(lambda config, field, sigma: make(field), cosine_decay, True) if callable(make) else _METHODS[make]
+    if callable(make):
+        return OptimizerKind(lambda config, field, sigma: make(field), cosine_decay, True)
+    return _KINDS[make]
 
 
 def _gaussian_adam(config: FitConfig, field: GaussianField, sigma: float) -> Any:
@@ -45,8 +47,8 @@ def _adam(config: FitConfig, field: GaussianField, sigma: float) -> Any:
     return ImageGSAdam(field, config.learning_rate_factor)
 
 
-_METHODS = {
-    "gaussian-adam": Method(_gaussian_adam, cosine_decay, True),
-    "adan": Method(_adan, GaussianImageAdan.rate, False),
-    "adam": Method(_adam, lambda progress: 1.0, False),
+_KINDS = {
+    "gaussian-adam": OptimizerKind(_gaussian_adam, cosine_decay, True),
+    "adan": OptimizerKind(_adan, GaussianImageAdan.rate, False),
+    "adam": OptimizerKind(_adam, lambda progress: 1.0, False),
 }
