@@ -8,11 +8,12 @@ PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 .PHONY: page wheel demo report test test-all notebooks docs lint clean
 
-# The stamp is newer than what it was made from, or the environment is made again.
+# The stamp is newer than what it was made from, or the environment is made again. Modules are compiled when they are first
+# imported: most of them never are.
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "kcgs needs Python 3.11 or later: make PYTHON=python3.11")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[$(EXTRAS)]'
+	$(BIN)/python -m pip install --no-compile --quiet --disable-pip-version-check -c constraints.txt -e '.[$(EXTRAS)]'
 	touch $@
 
 # The script of the pages that `kcgs view` and `kcgs export` write, anew from export/web; it is committed.

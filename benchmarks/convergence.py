@@ -9,18 +9,21 @@ from .core.compare import Comparison, differences, group_by, losses_table, means
 from .core.figures import Panel, save_lines
 from .core.fits import METHODS, QUICK_ITERATIONS, config_of, figures, fit_for, timed_fit
 from .core.images import choose, load_mapped
-from .core.run import Job, Options, Page, Row
+from .core.run import RESULTS_FILE, Job, Options, Page, Row, read_rows
+from .gpu_fit import GPU
 
 OTHERS = [*METHODS][1:]
 PUBLISHED = OTHERS[1:]
 NUM_GAUSSIANS = 1_250
+REPORT_OF_GPU = Path(__file__).parent / "reports/gpu-fit" / RESULTS_FILE
 BUDGETS = (2, 5, 15, 60)  # seconds of a core
 QUANTITIES = ("psnr", "ef_psnr")
 CASES = ["budget"]
 COMPARISONS = tuple(Comparison("best", other) for other in OTHERS)
 METHOD = f"""First frames of DAVIS with the given masks, N = {NUM_GAUSSIANS:,}. Each point is a fit of its own, which
 is planned for that time on one core: two short fits tell how long an iteration takes, and schedules are shortened by
-the recipes' own rule. Compilation is not in the times. Table: PSNR / EF-PSNR in dB."""
+the recipes' own rule. Compilation is not in the times. `{GPU}` is a fit of its 700 iterations, measured for the report
+of [gpu-fit](../gpu-fit/report.md); its seconds are those of the GPU. Table: PSNR / EF-PSNR in dB."""
 
 
 def measure(image: str, method: str, n: int, data: str, quick: bool) -> list[Row]:
@@ -44,9 +47,18 @@ def jobs(options: Options) -> list[Job]:
     return [{"image": i, "method": m, "n": n, **options.image_arguments()} for i in images for m in METHODS]
 
 
+def rows_of_gpu(images: set[str]) -> list[Row]:
+    """Read the fits of these images on a GPU, where they were measured."""
+    rows = read_rows(REPORT_OF_GPU) if REPORT_OF_GPU.is_file() else []
+    rows = [row for row in rows if row["image"] in images and (row["n"], row["method"]) == (NUM_GAUSSIANS, GPU)]
+    return [{**row, "budget": 0, "core_seconds": row["seconds"]} for row in rows]
+
+
 def page(folder: Path, rows: list[Row]) -> Page:
     """Write the report."""
-    save_lines(folder / "convergence.png", [Panel("", rows, "core_seconds", q) for q in QUANTITIES], "method", "budget")
+    of_gpu = rows_of_gpu({row["image"] for row in rows})
+    panels = [Panel("", rows + of_gpu, "core_seconds", quantity) for quantity in QUANTITIES]
+    save_lines(folder / "convergence.png", panels, "method", "budget")
     means = {
         (str(name), budget): fmean(values_of(group, "psnr"))
         for (name, budget), group in group_by(rows, ["method", "budget"]).items()
@@ -64,6 +76,9 @@ def page(folder: Path, rows: list[Row]) -> Page:
         f"`best` {''.join(ahead[:1])}has {means['best', end]:.2f} dB after {end}. After {start} seconds it has "
         f"{means['best', start]:.2f} dB, and `{first}`, the best by then, {means[first, start]:.2f} dB."
     )
+    if of_gpu:
+        seconds, value = (fmean(values_of(of_gpu, quantity)) for quantity in ("seconds", "psnr"))
+        answer += f" On a GPU `best` has {value:.2f} dB after {seconds:.1f} seconds."
     table = means_table(rows, ["method"], "budget", QUANTITIES)
     losses = losses_table(rows, COMPARISONS, QUANTITIES, CASES)
     gains = differences(rows, COMPARISONS, QUANTITIES, CASES)

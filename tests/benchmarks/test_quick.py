@@ -16,12 +16,16 @@ from benchmarks.core.run import Options, read_rows, write_rows
 from benchmarks.results import page
 from kcgs.data import save_labels
 
+# of which the quick form takes ten seconds
+SLOW = ("pairs", "rate")
 OF_A_GPU = ("gpu", "gpu-fit")
 REPORTS = Path(kcgs.__file__).resolve().parent.parent / "benchmarks/reports"
 
 
 @pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # of pycocotools
-@pytest.mark.parametrize("name", EXPERIMENTS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in EXPERIMENTS]
+)
 def test_quick_form(name: str, tmp_path: Path) -> None:
     if name in OF_A_GPU and not torch.cuda.is_available():
         pytest.skip("needs a CUDA device")

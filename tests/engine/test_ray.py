@@ -58,6 +58,7 @@ class TestCluster:
             run("double", 1, tmp_path, threads=3)
 
 
+@pytest.mark.slow
 def test_fit_many_on_a_cluster_of_its_own(
     importable: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

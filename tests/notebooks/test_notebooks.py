@@ -33,8 +33,11 @@ PRINTED = {
     "08_video": r"\d+ frames: [23]\d\.\d\d dB at first, [23]\d\.\d\d dB at last",
     "09_kornia_augmentation": r"mean of sixteen: 2\d\.\d\d dB; render: 2\d\.\d\d dB",
 }
-# those that take half a minute in their quick form, too
-SLOW = ("06_differentiable_layer", "07_compact_files")
+# a kernel takes ten seconds for what it imports, and the last two half a minute in their quick form: all run before a
+# release, by `make test-all`
+SLOW = (
+    "02_why_contours", "03_label_maps", "05_export_to_onnx", "08_video", "06_differentiable_layer", "07_compact_files"
+)  # fmt: skip
 BYTES = 2_700_000
 
 

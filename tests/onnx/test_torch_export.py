@@ -172,6 +172,7 @@ class TestTorchExport:
             inputs = (*gaussians(batch, count, size), torch.stack([labels_of(size).roll(k, 1) for k in range(batch)]))
             assert_close(run(session, *inputs), module(*inputs), 3e-4)  # the kernel interpolates wide Gaussians
 
+    @pytest.mark.slow
     def test_a_scene_at_sizes_below_and_above_its_own(self) -> None:
         regions = RegionMap.from_labels(labels_of(SIZE), PAIRS)
         module = Resized(Scene(GaussianField.random(40, SIZE, seed=0, regions=regions), regions)).eval()

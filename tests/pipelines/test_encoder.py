@@ -199,6 +199,7 @@ class TestOneGraph:
         with pytest.raises(RuntimeError, match="labels must hold non-negative ids"):
             compiled(images, labels - 1)
 
+    @pytest.mark.slow
     @pytest.mark.filterwarnings(
         "ignore:.*:DeprecationWarning", "ignore:.*:FutureWarning", "ignore:.*:UserWarning:torch"
     )
