@@ -1,4 +1,8 @@
-"""Errors that name the argument; they survive pickling, so that worker processes can raise them."""
+"""Errors that name the argument; they survive pickling, so that worker processes can raise them.
+
+They are raised where a command answers with the name of an option in place of the argument. Elsewhere a plain
+`ValueError` or `TypeError` has a message of the same form.
+"""
 
 from __future__ import annotations
 
