@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
@@ -78,9 +79,10 @@ def imports(path: Path, package: list[str]) -> Iterator[Import]:
                 yield Import(submodule, None) if submodule in MODULES else Import(source, alias.name)
 
 
-def imports_of(module: str) -> Iterator[Import]:
+@cache
+def imports_of(module: str) -> list[Import]:
     parts = module.split(".")
-    return imports(MODULES[module], parts if MODULES[module].name == "__init__.py" else parts[:-1])
+    return [*imports(MODULES[module], parts if MODULES[module].name == "__init__.py" else parts[:-1])]
 
 
 def graph() -> dict[str, set[str]]:
