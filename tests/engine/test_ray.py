@@ -24,12 +24,15 @@ ray = pytest.importorskip("ray", reason="needs the package ray: pip install 'kcg
 @pytest.fixture(scope="session")
 def cluster(importable: None) -> Iterator[None]:
     path = os.pathsep.join(filter(None, sys.path))
-    ray.init(
-        "local", num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR,
-        runtime_env={"env_vars": {"PYTHONPATH": path}},
-    )  # fmt: skip
-    yield
-    ray.shutdown()
+    with pytest.MonkeyPatch.context() as environment:
+        # by default workers have niceness 15: on a busy machine they would hardly run
+        environment.setenv("RAY_worker_niceness", "0")
+        ray.init(
+            "local", num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR,
+            runtime_env={"env_vars": {"PYTHONPATH": path}},
+        )  # fmt: skip
+        yield
+        ray.shutdown()
 
 
 def run(name: str, count: int, folder: Path, **options: Any) -> dict[int, Any]:
