@@ -16,8 +16,8 @@ HEAD = """# Results
 Each answer links to a report of one page: its table, its losses, and its command. All but those that say so were
 measured with one tree of `kcgs/`, `{tree}`; later trees have the same bits. Most others have the tree `8b2cd43`. Since
 that one fits add Gaussians in rounds, and remove those that others overlap. Label maps, files of a given scene, edits
-and renders by the CPU kernel kept their bits. Three photos each of `maps`, `enlarge` and `previews` were measured again:
-the mean PSNR differs by at most 0.03 dB.
+and renders by the CPU kernel kept their bits. Three photos each of `maps`, `enlarge` and `previews` were measured
+again: the mean PSNR differs by at most 0.03 dB.
 
 `python -m benchmarks quality -o report --data DATA --workers 2` measures the first anew, and goes on where it was
 stopped. `DATA` has the folders `DAVIS`, `bsds`, `kodak` and `cocostuff`; without it photos of scikit-image are
