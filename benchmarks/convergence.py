@@ -78,7 +78,7 @@ def page(folder: Path, rows: list[Row]) -> Page:
     )
     if of_gpu:
         seconds, value = (fmean(values_of(of_gpu, quantity)) for quantity in ("seconds", "psnr"))
-        answer += f" On a GPU `best` has {value:.2f} dB after {seconds:.1f} seconds."
+        answer += f" On a GPU `best` has {value:.2f} dB after {seconds:.1f} seconds (report of `gpu-fit`)."
     table = means_table(rows, ["method"], "budget", QUANTITIES)
     losses = losses_table(rows, COMPARISONS, QUANTITIES, CASES)
     gains = differences(rows, COMPARISONS, QUANTITIES, CASES)

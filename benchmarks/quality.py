@@ -89,8 +89,9 @@ def page(folder: Path, rows: list[Row]) -> Page:
     answer = (
         f"With the same number of Gaussians and in the same time, regions change the PSNR by {at_n[0]:+.2f} dB and the "
         f"EF-PSNR by {at_n[1]:+.2f} dB on {first[0]['group']}, with the same bits by {at_bits[0]:+.2f} and "
-        f"{at_bits[1]:+.2f} dB. The published method that comes closest, `{closest}`, is {behind[closest]:.2f} dB "
-        f"behind `best`, which is better in {count_wins(rows, Comparison('best', closest), 'psnr', CASES)} fits."
+        f"{at_bits[1]:+.2f} dB. Of the published methods `{closest}` comes closest: over all photos it is "
+        f"{behind[closest]:.2f} dB behind `best`, which is better in "
+        f"{count_wins(rows, Comparison('best', closest), 'psnr', CASES)} fits."
     )
     losses = losses_table(rows, COMPARISONS, QUANTITIES, CASES)
     losses_at_bits = losses_table(equal, [EQUAL_BITS], DECODED, CASES)
