@@ -38,8 +38,7 @@ table says. The photo is kodim05, with 10,000 Gaussians and without regions.
 
 GaussianImage's CUDA rasterizer, without regions, rendered the scenes of [our report]({LINK}/gpu/report.md) on another
 H200. Its gradients by two of the three numbers of a Cholesky factor were off by factors of 0.7 to 11 there; those of
-kcgs are within 0.002 of exact ones at its default cutoff. Its contours are hard or soft. Milliseconds of one image / of
-one image and its gradients:
+kcgs are within 0.002 of exact ones at its default cutoff. Milliseconds of one image / of one image and its gradients:
 
 | scene | GaussianImage | kcgs | kcgs, a CUDA graph |
 |---|---|---|---|
