@@ -43,8 +43,8 @@ def test_entry(entry: Entry) -> None:
     assert entry.licence in (folder / "card.md").read_text() and (folder / "preview.jpg").is_file()
     model = scene_decoder(scene)
     session = onnxruntime.InferenceSession(model.SerializeToString())
-    for divisor in (1, 2):
-        size = (image.shape[1] // divisor, image.shape[2] // divisor)
+    for factor in (1, 2):
+        size = (factor * image.shape[1], factor * image.shape[2])
         (rendered,) = session.run(None, {"size": np.array(size)})
         assert (torch.from_numpy(rendered)[0] - scene.render(size)).abs().max() < 1e-3
 
