@@ -19,7 +19,7 @@ METHODS: dict[str, Method] = {
     "no densification": ("best", {"densify_from": 1.0}),
     "hard contours": ("best", {"softness": 0.0}),
     "contours as given": ("best", {"move_contours": False, "merge_regions": False}),
-    "L1 loss": ("best", {"loss": "l1"}),
+    "L1 loss": ("best", {"objective": "l1"}),
     "Adam of Image-GS": ("best", {"optimizer": "adam"}),
     "no regions": ("best-baseline", {}),
 }

@@ -66,7 +66,7 @@ def objectives(path: Path) -> None:
     image = torch.from_numpy(coffee() / 255).permute(2, 0, 1).float()
     labels = segment(image)
     panels = {"photo": image}
-    for name in ("psnr", "ms-ssim"):
+    for name in ("l2", "ms-ssim"):
         result = fit_bytes(image, labels, NUM_BYTES, objective=name)
         metrics = evaluate(result.scene, image, labels)
         figures = (

@@ -35,7 +35,7 @@ LAYERS = [
     {"compiled", "engine", "plots"},
     {"_labels"},
     {"_image"},
-    {"_atomic", "_check", "_decode", "_memory", "_progress", "_repr", "_sizes", "_suffixes", "_warn"},
+    {"_atomic", "_check", "_decode", "_memory", "_objectives", "_progress", "_repr", "_sizes", "_suffixes", "_warn"},
     {"errors", "_rows"},
 ]
 # modules beside the `__init__` of a room that other rooms import, two of a room at most: they load numba or Triton

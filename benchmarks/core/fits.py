@@ -32,7 +32,7 @@ Method = tuple[str, dict[str, Any]]  # a recipe, and settings that differ from i
 METHODS: dict[str, Method] = {
     **{name: (name, {}) for name in ("best", "best-baseline", "paper", "gaussian-image", "gaussian-image-clamp")},
     # SSIM in torch takes ten times as long as all else: with it there would be 20 iterations
-    "image-gs, L1 alone": ("image-gs", {"loss": "l1"}),
+    "image-gs, L1 alone": ("image-gs", {"objective": "l1"}),
 }
 
 

@@ -71,7 +71,7 @@ def compare(output: Path, image: Tensor, target_bytes: int, **settings: Any) -> 
     table = Table("", "PSNR (dB)", "EF-PSNR (dB)", "seconds", "bytes", title=f"At most {target_bytes:,} bytes")
     for (name, title), regions in zip(TITLES.items(), (None, labels), strict=True):
         start = time.perf_counter()
-        result = fit_bytes(image, regions, target_bytes, objective="psnr", **settings)
+        result = fit_bytes(image, regions, target_bytes, objective="l2", **settings)
         seconds = time.perf_counter() - start
         (output / f"{name}.kcgs").write_bytes(result.data)
         save_image(output / f"{name}.png", result.scene.render())

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from kcgs._atomic import write_file
+from kcgs._objectives import objective_for
 from kcgs._progress import Progress
 from kcgs._suffixes import SCENES
 from kcgs.errors import InvalidArgument
@@ -106,6 +107,9 @@ def fit_and_save(
     from kcgs.scene import Scene
 
     config, is_compressed = request.load_config(), output.suffix == ".kcgs"
+    objective = objective_for("fit", config.objective)
+    if is_compressed and request.target_bytes is None:  # the file lowers what the fit does
+        objective = objective_for("file", objective)
     target_psnr = config.target_psnr
     if target_psnr is not None and is_compressed:
         config = config.model_copy(update={"target_psnr": target_psnr + _ROUNDING_MARGIN})
@@ -119,11 +123,7 @@ def fit_and_save(
     elif is_compressed:
         result = fit(*on_device, request.num_gaussians, **settings)
         quality = quality_for(max(entry.psnr for entry in result.history)) if target_psnr is None else None
-        goal: Any = {
-            "quality": quality,
-            "target_psnr": target_psnr,
-            "objective": "psnr" if config.objective == "auto" else config.objective,
-        }
+        goal: Any = {"quality": quality, "target_psnr": target_psnr, "objective": objective}
         with Progress("writing the file", pulse=True, visible=progress):
             compressed = compress(result.scene, image, seed=request.seed, **goal)
         scene, num_bytes = compressed.scene, write_file(output, compressed.data)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
+from kcgs._objectives import PURPOSES, check_objective
 from kcgs.errors import InvalidArgument
 
 if TYPE_CHECKING:
@@ -27,9 +28,12 @@ Threshold = Annotated[
     typer.Option(min=0, help="Of a mask with soft edges: grey level above which a pixel is of the object."),
 ]
 Objective = Annotated[
-    Literal["auto", "psnr", "ms-ssim"] | None,
+    str | None,
     typer.Option(
-        help="What to maximize; auto, the default: ms-ssim with --target-bytes and for kcgs encode, else psnr."
+        metavar="|".join(PURPOSES["fit"]),
+        callback=check_objective,
+        help=f"What to lower: the squared or the absolute error, or what MS-SSIM lacks. Default: {PURPOSES['fit'][0]}; "
+        f"with --target-bytes and for kcgs encode {PURPOSES['file'][0]}. Files take {' or '.join(PURPOSES['file'])}.",
     ),
 ]
 

@@ -183,7 +183,7 @@ def encode(
         if image is None:
             data = codec.encode(loaded, **goal)
         else:
-            data = compress(loaded, load_image(image), **goal, objective=objective or "auto").data
+            data = compress(loaded, load_image(image), **goal, objective=objective).data
     write_file(output, data)
     rounded = codec.decode(data).scene
     report = {

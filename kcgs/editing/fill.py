@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -11,7 +13,7 @@ from kcgs.functional import RegionMap, region_splat
 from kcgs.nn import GaussianField, join
 from kcgs.optim import (
     End,
-    FieldDescent,
+    FieldState,
     GaussianAdam,
     Gaussians,
     Renderer,
@@ -19,6 +21,7 @@ from kcgs.optim import (
     cosine_decay,
     count_iterations,
     run,
+    step_field,
 )
 from kcgs.scene import Scene
 
@@ -112,6 +115,6 @@ def _fit(field: GaussianField, regions: RegionMap, target: Tensor, weight: Tenso
     rate, color_rate = field.means.detach().new_tensor([_RATE, _COLOR_RATE])
     optimizer = GaussianAdam(field, rate, color_lr=color_rate)
     renderer = Renderer(field.size, regions, _CUTOFF)
-    descent = FieldDescent(field, optimizer, SquaredError(target, weight), renderer)
-    run(descent, count_iterations(descent, _STEPS), [End()], cosine_decay)
+    state = FieldState(field, optimizer, SquaredError(target, weight), renderer)
+    run(state, partial(step_field, state), count_iterations(state, _STEPS), [End()], cosine_decay)
     return field

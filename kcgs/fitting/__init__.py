@@ -1,6 +1,6 @@
 """An image in, a scene out."""
 
-from .config import FitConfig, ObjectiveName, available_recipes
+from .config import FitConfig, available_recipes
 from .contour_moves import move_contours
 from .initial import initial_field
 from .loop import fit, fit_problem, precompile

@@ -4,31 +4,28 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Callable
 from difflib import get_close_matches
 from importlib.resources import files
 from typing import Any, Literal, cast
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from torch import Tensor
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
+from kcgs._objectives import ObjectiveName, check_objective
 from kcgs._repr import shorten
 from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.kernels import BACKENDS
 from kcgs.maps import MAX_SOFTNESS
-from kcgs.nn import GaussianField
-from kcgs.optim import Event
 
-ObjectiveName = Literal["auto", "psnr", "ms-ssim"]
 _USUAL_ITERATIONS = 700
-# settings that take more than names
-_OWN = {"densify": "an event", "objective": "a function", "optimizer": "a function"}
+# settings of version 0.3, and what to write now
+_RENAMED = {"loss": "objective has its values"}
 
 
 class FitConfig(BaseModel):
     """Settings of a fit; the defaults are the recipe `best`.
 
-    Convention: moments of a fit are fractions of its iterations, so that 500 and 50,000 both make sense. What an
+    Convention: all values are plain: numbers, strings and None. Functions of your own are arguments of
+    :func:`kcgs.fit`. Moments of a fit are fractions of its iterations, so that 500 and 50,000 both make sense. What an
     event or an optimizer needs beyond these are fields of its class.
 
     Raises:
@@ -39,7 +36,7 @@ class FitConfig(BaseModel):
         False
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     # The model
     guidance: bool = Field(True, description="confine Gaussians to regions, where regions are given")
@@ -62,8 +59,8 @@ class FitConfig(BaseModel):
         description="where the first centres are; uniform: anywhere, with the image's colours; random: anywhere, with "
         "random colours; gradient: where the image changes, as Image-GS",
     )
-    densify: Literal["matching-pursuit", "largest-error"] | Event = Field(
-        "matching-pursuit", description="where Gaussians are added; largest-error: as Image-GS; or an event of your own"
+    densify: Literal["matching-pursuit", "largest-error"] = Field(
+        "matching-pursuit", description="where Gaussians are added; largest-error: as Image-GS"
     )
     densify_from: float = Field(0.01, gt=0.0, le=1.0, description="fraction of N at the start; the rest is added later")
     warmup: bool = Field(
@@ -83,16 +80,16 @@ class FitConfig(BaseModel):
     )
 
     # The descent
-    objective: ObjectiveName | Callable[[Tensor], Tensor] = Field(
-        "auto",
-        description="psnr: minimize `loss`; ms-ssim: maximize MS-SSIM, with loss l2; auto: ms-ssim for a file of a "
-        "given size, else psnr; or a loss of your own, a function from a render (1, C, H, W) to a scalar",
+    objective: ObjectiveName | None = Field(
+        None,
+        description="what is lowered: l2, the squared error; l1; ms-ssim, what MS-SSIM lacks; l1+ssim: L1 + "
+        "0.1 (1 - SSIM), as Image-GS. None: l2, for a file of a size or quality ms-ssim. Files and videos take l2 and "
+        "ms-ssim",
     )
-    loss: Literal["l1", "l2", "l1+ssim"] = Field("l2", description="l1+ssim: L1 + 0.1 (1 - SSIM), as Image-GS")
-    optimizer: Literal["gaussian-adam", "adan", "adam"] | Callable[[GaussianField], Any] = Field(
+    optimizer: Literal["gaussian-adam", "adan", "adam"] = Field(
         "gaussian-adam",
         description="gaussian-adam: Adam in each Gaussian's own frame; adan: as GaussianImage; adam: as Image-GS; each "
-        "has its own parameters and learning rates; or a function from a field to an optimizer like GaussianAdam",
+        "has its own parameters and learning rates",
     )
     learning_rate_factor: float = Field(1.0, gt=0.0, description="factor on all learning rates of the optimizer")
     min_sigma: float = Field(
@@ -113,12 +110,15 @@ class FitConfig(BaseModel):
         None, gt=0.0, description="the fewest Gaussians that reach this PSNR (dB), by a search over several fits"
     )
 
+    @field_validator("objective", mode="before")
+    @classmethod
+    def _check_objective(cls, value: object) -> ObjectiveName | None:
+        return check_objective(value)
+
     def model_post_init(self, context: Any) -> None:
         """Check what types do not express."""
         if self.backend not in BACKENDS:
             raise InvalidArgument("backend", f"one of {', '.join(BACKENDS)}", repr(self.backend))
-        if self.objective == "ms-ssim" and self.loss != "l2":
-            raise InvalidArgument("objective", f"psnr with loss {self.loss!r}", repr(self.objective))
         if self.softness != "auto" and not 0.0 <= self.softness <= MAX_SOFTNESS:
             raise InvalidArgument("softness", f"'auto' or in [0, {MAX_SOFTNESS:g}] pixels", repr(self.softness))
         if self.max_move != "any" and self.max_move < 1.0:
@@ -151,7 +151,7 @@ class FitConfig(BaseModel):
             ValueError: unknown recipe or setting, or a value out of range.
         """
         if isinstance(recipe, FitConfig):
-            values = dict(recipe)  # not `model_dump`, which takes a dataclass apart, such as an event
+            values = recipe.model_dump()
         elif not isinstance(recipe, str):
             raise InvalidArgumentType("recipe", "a name or a FitConfig", type(recipe).__name__)
         elif recipe not in available_recipes():
@@ -179,12 +179,12 @@ def _first(error: ValidationError) -> Exception:
     detail = error.errors()[0]
     name = ".".join(map(str, detail["loc"][:1]))  # without the branches of a union
     if detail["type"] == "extra_forbidden":
+        if name in _RENAMED:
+            return ValueError(f"unknown setting {name!r}: {_RENAMED[name]}")
         near = get_close_matches(name, FitConfig.model_fields, 1)
         hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(FitConfig.model_fields)}"
         return ValueError(f"unknown setting {name!r}: {hint}")
     if detail["type"] == "value_error":
         return cast(Exception, detail["ctx"]["error"])
     expected = detail["msg"].removeprefix("Input should be ")
-    if detail["type"] == "literal_error" and name in _OWN:
-        expected += f", or {_OWN[name]} of your own"
     return InvalidArgument(name, expected, repr(detail["input"]))

@@ -4,34 +4,31 @@ from __future__ import annotations
 
 import torch
 
-from kcgs.kernels import settle
 from kcgs.optim import Gaussians
 from kcgs.pruning import prune
 
-from .divergence import is_finite
-from .events import EndDrafts
-from .events.log import collect_measurements, measure
+from .measurement import measure_errors, snapshot
 from .region_report import report_regions
 from .removal import remove_gaussians
 from .result import FitResult, StopReason
-from .state import FitState
+from .state import Errors, FitState, Measurement, record
 
 
 def finish(state: FitState, reason: StopReason, seconds: float) -> FitResult:
     """Measure the last scene, take the best, and prune it; return a fit that ended for a reason."""
-    problem, config = state.problem, state.problem.config
-    collect_measurements(state, wait=True)
-    settle(problem.image.device, problem.size)
-    best_draft = state.best if state.is_draft else None
-    EndDrafts().act(state)
+    problem, config, best_draft = state.problem, state.problem.config, state.best
     with torch.no_grad():
-        if best_draft is not None:
-            renderer = state.renderer._replace(regions=best_draft.regions)
-            measure(state, best_draft, renderer.render(Gaussians.of(best_draft.field)), seconds)
-        if reason != "diverged" and is_finite(state.field):
+        if state.is_draft:
+            state.end_drafts()
+            if best_draft is not None:
+                renderer = state.renderer._replace(regions=best_draft.regions)
+                errors = measure_errors(problem, renderer.render(Gaussians.of(best_draft.field)))
+                measurement = Measurement(state.iteration, seconds, best_draft, is_draft=False)
+                record(state, measurement, Errors(*errors.tolist()))
+        if reason != "diverged" and state.is_finite:
             remove_gaussians(state, state.num_gaussians - problem.num_gaussians)
-            measure(state, state.scene, state.render(), seconds)
-    collect_measurements(state, wait=True)
+            errors = measure_errors(problem, state.render())
+            record(state, snapshot(state, seconds), Errors(*errors.tolist()))
     assert state.best is not None
     scene, num_pruned, prune_error = state.best, 0, 0.0
     if config.prune > 0:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from functools import lru_cache
+from collections.abc import Callable
+from functools import lru_cache, partial
 from typing import Any, cast
 
 import torch
@@ -14,22 +15,23 @@ from kcgs._warn import warn_user
 from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
 from kcgs.kernels import prepare
-from kcgs.optim import End, Event, run
+from kcgs.nn import GaussianField
+from kcgs.optim import End, Event, Loss, run
 
+from .checkpoint import Checkpoint
 from .clock import Clock
 from .config import FitConfig
-from .divergence import StopAtDivergence
-from .events.checkpoint import Checkpoint
-from .events.log import Log
+from .custom import Densifier, split_names
+from .events import Log, OnStep, Report, StopAtDivergence
 from .finish import finish
 from .optimizers import optimizer_kind
 from .problem import Problem, make_problem
-from .report import OnStep, Report
 from .result import FitResult, StopReason
 from .schedule import make_schedule
 from .search import search
 from .start import start
 from .state import FitState
+from .steppers import Stepper, make_stepper
 
 
 @torch.inference_mode(False)
@@ -40,6 +42,9 @@ def fit(
     num_gaussians: int = 1000,
     *,
     recipe: str | FitConfig = "best",
+    objective: str | Loss | None = None,
+    densify: str | Densifier | None = None,
+    optimizer: str | Callable[[GaussianField], Any] | None = None,
     seed: int = 0,
     on_step: OnStep | None = None,
     progress: bool = False,
@@ -57,10 +62,9 @@ def fit(
     scene holds fewer than N Gaussians where the recipe prunes, or its target takes fewer. With `target_psnr` several
     fits search for the fewest Gaussians that reach it; `on_step` counts the iterations of each.
 
-    `objective` may be a loss of your own, such as one of Kornia's: a function from a render, :math:`(1, C, H, W)`, not
-    clipped, to a scalar, through which autograd goes. The history's `loss` is then this loss, and the scene of the
-    lowest is returned. Gaussians are added where the render differs from the image, and contours move to it; without an
-    image they are added where the loss has its slope, contours stay, and PSNR is NaN.
+    The history's `loss` is the value of the objective. With a loss of your own, such as one of Kornia's, the scene of
+    the lowest is returned. Gaussians are added where the render differs from the image, and contours move to it;
+    without an image they are added where the loss has its slope, contours stay, and PSNR is NaN.
 
     Args:
         image: Tensor :math:`(C, H, W)` or :math:`(1, C, H, W)`, floating, values in [0, 1]; a numpy array
@@ -73,6 +77,13 @@ def fit(
             regions, those most alike are merged until each has a Gaussian, or with ``merge_regions=False`` the smaller
             ones stay empty and black; a UserWarning gives their number.
         recipe: a name from :func:`available_recipes`, or settings.
+        objective: what is lowered, by a name of :class:`FitConfig`; or a loss of your own, a function from a render,
+            :math:`(1, C, H, W)`, not clipped, to a scalar, through which autograd goes. None: the recipe's, else l2.
+        densify: where Gaussians are added, by a name of :class:`FitConfig`; or an event of your own: an object with
+            ``act(state)``, called before every step, and ``end``, the share of the fit at its last addition. None: the
+            recipe's.
+        optimizer: a name of :class:`FitConfig`, or a function from a field to an optimizer with the methods of
+            :class:`kcgs.optim.GaussianAdam`. None: the recipe's.
         seed: of the random start.
         on_step: called after every iteration with its number (from 1) and the last history entry; returning True
             stops the fit.
@@ -81,8 +92,7 @@ def fit(
         resume: go on from `checkpoint` where it exists; the result is that of an uninterrupted fit.
         size: (height, width) of the render, without an image.
         channels: C, without an image.
-        settings: fields of :class:`FitConfig`, in place of the recipe's. An event that adds Gaussians, or a function
-            from a field to an optimizer, may stand for the name of one.
+        settings: other fields of :class:`FitConfig`, in place of the recipe's.
 
     Returns:
         The scene (its contours moved, its regions merged, where the recipe does so), history, why it stopped, settings,
@@ -103,11 +113,12 @@ def fit(
         >>> result.history[-1].psnr > 20, result.scene.regions.num_regions
         (True, 2)
     """
-    config = FitConfig.from_recipe(recipe, **settings)
-    problem = make_problem(image, regions, num_gaussians, config, seed, size, channels)
+    named, custom = split_names(objective=objective, densify=densify, optimizer=optimizer)
+    config = FitConfig.from_recipe(recipe, **named, **settings)
+    problem = make_problem(image, regions, num_gaussians, config, seed, custom, size=size, channels=channels)
     if resume and checkpoint is None:
         raise InvalidArgument("checkpoint", "a file to go on from, with resume", None)
-    own = [name for name in ("objective", "densify", "optimizer") if not isinstance(getattr(config, name), str)]
+    own = [name for name, value in custom._asdict().items() if value is not None]
     if own and checkpoint is not None:
         raise InvalidArgument("checkpoint", f"None with {own[0]} of your own, which no file keeps", repr(checkpoint))
     if config.target_psnr is not None and checkpoint is not None:
@@ -123,8 +134,6 @@ def precompile(config: FitConfig, device: torch.device | str = "cpu") -> None:
     labels = (ramp > 0.6).long().expand(64, 96).contiguous()
     iterations = min(config.num_iterations, 20)
     update: dict[str, Any] = {"iterations": iterations, "max_seconds": None, "target_psnr": None, "backend": "auto"}
-    if callable(config.objective):  # it may be of one size
-        update["objective"] = "auto"
     fit(image, labels, 24, recipe=config.model_copy(update=update))
 
 
@@ -135,43 +144,50 @@ def fit_problem(
     checkpoint: str | os.PathLike[str] | None = None,
     resume: bool = False,
     until: float = 1.0,
+    stepper_of: Callable[[FitState], Stepper] = make_stepper,
 ) -> FitResult:
     """Solve a problem whose arguments are checked, up to a share of its schedule: see `fit`."""
+    canvas = problem.canvas
     if problem.config.max_seconds is not None:
-        precompile(problem.config, problem.image.device)
-    prepare(problem.config.backend, problem.image.device, problem.image.dtype, len(problem.image))
+        precompile(problem.config, canvas.device)
+    prepare(problem.config.backend, canvas.device, canvas.dtype, len(canvas))
     _warn_of_regions(problem)
     searches = problem.config.target_psnr is not None
-    with Progress("fit", pulse=searches, visible=progress) as bar, threads_for_kernels(problem.image[0].numel()):
+    with Progress("fit", pulse=searches, visible=progress) as bar, threads_for_kernels(canvas[0].numel()):
+        run_from = partial(_run, stepper_of=stepper_of, bar=bar, on_step=on_step)
         if searches:
-            return search(problem, lambda state: _run(state, Clock(), bar, on_step))
+            return search(problem, lambda state: run_from(state, Clock()))
         store = None if checkpoint is None else Checkpoint(checkpoint, problem)
         if store is not None and resume and store.path.exists():
             state, seconds = store.read()
-            return _run(state, Clock(seconds), bar, on_step, store)
+            return run_from(state, Clock(seconds), store=store)
         clock = Clock()
-        return _run(start(problem), clock, bar, on_step, store, until)
+        return run_from(start(problem), clock, store=store, until=until)
 
 
 def _run(
     state: FitState,
     clock: Clock,
+    *,
+    stepper_of: Callable[[FitState], Stepper],
     bar: Progress,
     on_step: OnStep | None,
     store: Checkpoint | None = None,
     until: float = 1.0,
 ) -> FitResult:
-    """Take a fit from its state to its end."""
-    config = state.problem.config
+    """Take a fit from its state to its end: events act, the stepper steps."""
+    config, stepper = state.problem.config, stepper_of(state)
     limit, max_seconds = config.max_iterations, config.max_seconds or math.inf
 
     def progress() -> float:
         return min(1.0, max(state.iteration / limit, clock.seconds() / max_seconds))
 
     end = End(until, lambda: "seconds" if clock.seconds() >= max_seconds else "iterations")
-    report = Report(state, clock, bar, on_step, store)
-    events: list[Event] = [report, end, StopAtDivergence(), *make_schedule(config), Log(clock)]
-    reason = run(state, progress, events, optimizer_kind(config).rate)
+    report = Report(stepper, clock, bar, on_step, store)
+    schedule, log = make_schedule(state.problem), Log(stepper, clock)
+    events: list[Event] = [report, end, StopAtDivergence(stepper), *schedule, log]
+    reason = run(state, stepper.step, progress, events, optimizer_kind(state.problem).rate)
+    stepper.poll(wait=True)
     return finish(state, cast(StopReason, reason), clock.seconds())
 
 

@@ -9,6 +9,7 @@ from kcgs.nn import GaussianField
 from kcgs.optim import COLOR_LEARNING_RATE, LEARNING_RATE, GaussianAdam, cosine_decay
 
 from .config import FitConfig
+from .problem import Problem
 from .published.gaussian_image import GaussianImageAdan
 from .published.image_gs import ImageGSAdam
 
@@ -21,15 +22,17 @@ class OptimizerKind(NamedTuple):
     rate: Callable[[float], float]
     """Factor of the learning rates, by progress."""
     has_drafts: bool
-    """True where most of the fit has a larger cutoff, and its state may go on with other Gaussians."""
+    """True where most of a fit renders with a larger cutoff."""
+    keeps_averages: bool
+    """True where averages stay when Gaussians are added or removed, so that a fit may go on from a finished one."""
 
 
-def optimizer_kind(config: FitConfig) -> OptimizerKind:
+def optimizer_kind(problem: Problem) -> OptimizerKind:
     """Return the kind that the settings name, or one around a user's function from a field to an optimizer."""
-    make = config.optimizer
-    if callable(make):
-        return OptimizerKind(lambda config, field, sigma: make(field), cosine_decay, True)
-    return _KINDS[make]
+    make = problem.custom.optimizer
+    if make is not None:
+        return OptimizerKind(lambda config, field, sigma: make(field), cosine_decay, True, True)
+    return _KINDS[problem.config.optimizer]
 
 
 def _gaussian_adam(config: FitConfig, field: GaussianField, sigma: float) -> Any:
@@ -48,7 +51,7 @@ def _adam(config: FitConfig, field: GaussianField, sigma: float) -> Any:
 
 
 _KINDS = {
-    "gaussian-adam": OptimizerKind(_gaussian_adam, cosine_decay, True),
-    "adan": OptimizerKind(_adan, GaussianImageAdan.rate, False),
-    "adam": OptimizerKind(_adam, lambda progress: 1.0, False),
+    "gaussian-adam": OptimizerKind(_gaussian_adam, cosine_decay, True, True),
+    "adan": OptimizerKind(_adan, GaussianImageAdan.rate, False, False),
+    "adam": OptimizerKind(_adam, lambda progress: 1.0, False, False),
 }

@@ -11,15 +11,19 @@ from torch import Tensor
 
 from kcgs._check import check_count, check_size
 from kcgs._image import as_image
+from kcgs._objectives import Purpose, objective_for
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap, edge_band
 from kcgs.maps import as_region_map
-from kcgs.optim import AbsoluteError, LossObjective, MsSsim, Objective, SquaredError
+from kcgs.optim import OBJECTIVES, ImageObjective, LossObjective, MsSsim, Objective
 
 from .config import FitConfig
+from .custom import NONE, Custom
 from .published.ssim_loss import AbsoluteAndSsim
 
-_LOSSES = {"l1": AbsoluteError, "l2": SquaredError, "l1+ssim": AbsoluteAndSsim}
+_OBJECTIVES: dict[str, type[ImageObjective]] = {**OBJECTIVES, "l1+ssim": AbsoluteAndSsim}
+# of every value, where there is no image
+_GREY = 0.5
 # share of an image's values that are 0 or 1 from which on `clamp="auto"` lets Gaussians overshoot them
 _SATURATED_SHARE = 0.25
 
@@ -28,21 +32,35 @@ _SATURATED_SHARE = 0.25
 class Problem:
     """What is to be fitted; nothing here changes during a fit."""
 
-    image: Tensor
-    """(C, H, W), in [0, 1]; NaN where there is none."""
+    canvas: Tensor
+    """(C, H, W), in [0, 1]: the image, or grey of the size of the render, which the first Gaussians show."""
     regions: RegionMap | None
     """The map as the user gave it."""
     num_gaussians: int
     """N, the most that the result may have."""
     config: FitConfig
+    """Its objective is a name, unless `custom` has one."""
     seed: int
+    custom: Custom = NONE
+    has_image: bool = True
+    """False: only the objective says what is wanted."""
     reduction: int = 1
     """Factor by which the sides of a photo were reduced to those of the image."""
 
     @property
+    def image(self) -> Tensor | None:
+        """The image, (C, H, W), if there is one."""
+        return self.canvas if self.has_image else None
+
+    @property
     def size(self) -> tuple[int, int]:
-        """(height, width) of the image."""
-        return self.image.shape[1], self.image.shape[2]
+        """(height, width) of the render."""
+        return self.canvas.shape[1], self.canvas.shape[2]
+
+    @property
+    def device(self) -> torch.device:
+        """Where the fit is computed."""
+        return self.canvas.device
 
     @cached_property
     def bounds(self) -> tuple[Tensor, Tensor] | None:
@@ -52,17 +70,17 @@ class Problem:
         and at 1 only where it is 1.
         """
         if self.config.clamp == "auto":
-            black, white = self.image == 0.0, self.image == 1.0
+            black, white = self.canvas == 0.0, self.canvas == 1.0
             if float((black | white).float().mean()) < _SATURATED_SHARE:
                 return None
             return torch.where(black, 0.0, -torch.inf), torch.where(white, 1.0, torch.inf)
-        return (self.image.new_zeros(()), self.image.new_ones(())) if self.config.clamp else None
+        return (self.canvas.new_zeros(()), self.canvas.new_ones(())) if self.config.clamp else None
 
     @cached_property
     def band(self) -> Tensor:
         """Rows and columns (M, 2) of the pixels near a contour of the user's map, for EF-PSNR."""
         if self.regions is None:
-            return torch.empty(0, 2, dtype=torch.int64, device=self.image.device)
+            return torch.empty(0, 2, dtype=torch.int64, device=self.device)
         return edge_band(self.regions.labels).nonzero().contiguous()
 
     @property
@@ -70,27 +88,14 @@ class Problem:
         """True where the softness of contours is to be chosen, and the map came without."""
         return self.config.softness == "auto" and self.regions is not None and self.regions.softness == 0.0
 
-    @property
-    def has_own_loss(self) -> bool:
-        """True where the objective is a function of the user's."""
-        return callable(self.config.objective)
-
-    @cached_property
-    def has_image(self) -> bool:
-        """True where there is an image."""
-        return not bool(self.image.isnan().any())
-
     @cached_property
     def objective(self) -> Objective:
         """What the descent lowers."""
-        if callable(self.config.objective):
-            return LossObjective(self.config.objective, self.image, self.has_image)
-        return MsSsim(self.image, self.reduction) if self.config.objective == "ms-ssim" else self.loss
-
-    @cached_property
-    def loss(self) -> Objective:
-        """What the history calls loss."""
-        return self.objective if self.has_own_loss else _LOSSES[self.config.loss](self.image)
+        if self.custom.objective is not None:
+            return LossObjective(self.custom.objective, self.image)
+        assert self.config.objective is not None
+        kind = _OBJECTIVES[self.config.objective]
+        return MsSsim(self.canvas, self.reduction) if kind is MsSsim else kind(self.canvas)
 
 
 def make_problem(
@@ -99,11 +104,17 @@ def make_problem(
     num_gaussians: object,
     config: FitConfig,
     seed: object,
+    custom: Custom = NONE,
+    *,
+    purpose: Purpose = "fit",
     size: tuple[int, int] | None = None,
     channels: int = 3,
 ) -> Problem:
-    """Check the arguments of a fit."""
-    if image is None and callable(config.objective):
+    """Check the arguments of a fit for a purpose."""
+    if custom.objective is None:
+        config = config.model_copy(update={"objective": objective_for(purpose, config.objective)})
+    has_image = image is not None
+    if image is None and custom.objective is not None:
         if size is None:
             raise InvalidArgument("size", "(height, width) without an image", None)
         if config.target_psnr is not None:
@@ -111,17 +122,17 @@ def make_problem(
         # what needs an image: contours stay as they are
         update = {"move_contours": False, "merge_regions": False}
         config = config.model_copy(update=update | ({"softness": 0.0} if config.softness == "auto" else {}))
-        image = torch.full((check_count("channels", channels), *check_size("size", size)), torch.nan)
-        regions = regions_of(image.shape[1:], regions)
-        image = image if regions is None else image.to(regions.ids.device)
+        canvas = torch.full((check_count("channels", channels), *check_size("size", size)), _GREY)
+        region_map = regions_of(canvas.shape[1:], regions)
+        canvas = canvas if region_map is None else canvas.to(region_map.ids.device)
     elif image is None and size is not None:
         raise InvalidArgument("image", "given, unless objective is a loss of your own", None)
     elif size is not None:
         raise InvalidArgument("size", "None with an image", size)
     else:
-        image, regions = check_image_and_regions(image, regions)
-    count = check_num_gaussians(num_gaussians, image)
-    return Problem(image, regions, count, config, check_count("seed", seed, 0, 2**63 - 1))
+        canvas, region_map = check_image_and_regions(image, regions)
+    count = check_num_gaussians(num_gaussians, canvas)
+    return Problem(canvas, region_map, count, config, check_count("seed", seed, 0, 2**63 - 1), custom, has_image)
 
 
 def check_image_and_regions(image: Any, regions: object) -> tuple[Tensor, RegionMap | None]:

@@ -19,6 +19,7 @@ from kcgs.nn import GaussianField
 from kcgs.optim import Objective, Renderer, halve
 
 from .problem import regions_of
+from .state import FitState
 
 # Standard deviations that are tried, in pixels, by the side of the blocks that the residual is averaged over for them.
 # More of them, and smaller blocks, cost time, and descent changes them anyway.
@@ -121,6 +122,13 @@ def propose_for(objective: Objective, rendered: Tensor, renderer: Renderer, coun
         x, y = added.means.detach().long().unbind(-1)
         added.colors.data = added.colors.detach() / root[y, x, None]
     return added
+
+
+def add_gaussians(state: FitState, count: int) -> None:
+    """Add at most so many Gaussians to a fit, if any, that lower its objective most."""
+    if count > 0:
+        added = propose_for(state.objective, state.render().detach(), state.renderer, count)
+        state.optimizer.append(state.field, added)
 
 
 def _local_maxima(residual: Tensor, regions: RegionMap | None, floor: float) -> tuple[Tensor, ...]:

@@ -1,31 +1,25 @@
-"""The events of a fit, by its settings."""
+"""The events of a fit that change its scene, by its settings."""
 
 from __future__ import annotations
 
 from kcgs.optim import Event
 
-from .config import FitConfig
 from .events import AdaptContours, Densify, EndDrafts, SettleContours
+from .problem import Problem
 from .published.largest_error import DensifyAtLargestError
 from .published.warmup import Warmup
 
 _DENSIFIERS = {"matching-pursuit": Densify, "largest-error": DensifyAtLargestError}
 
 
-def make_schedule(config: FitConfig) -> list[Event]:
-    """Return the events that change the scene, in the order in which they act."""
-    densify = make_densify(config)
+def make_schedule(problem: Problem) -> list[Event]:
+    """Return the events, in the order in which they act."""
+    config, contours = problem.config, AdaptContours() if problem.config.move_contours else None
+    densify = problem.custom.densify or _DENSIFIERS[config.densify](contours)
     events: list[Event] = [EndDrafts()]
     if config.warmup:
         events.append(Warmup())
     events.append(densify)
     if config.move_contours:
-        events.append(SettleContours(getattr(densify, "end", Densify.end)))
+        events.append(SettleContours(densify.end))
     return events
-
-
-def make_densify(config: FitConfig) -> Event:
-    """Return the event that adds Gaussians: by name, or the user's own."""
-    if not isinstance(config.densify, str):
-        return config.densify
-    return _DENSIFIERS[config.densify](AdaptContours() if config.move_contours else None)

@@ -17,12 +17,11 @@ import torch
 from kcgs.functional import psnr
 
 from .clock import Clock
-from .events import Densify
 from .optimizers import optimizer_kind
 from .problem import Problem
+from .pursuit import add_gaussians
 from .removal import remove_gaussians
 from .result import FitResult
-from .schedule import make_densify
 from .start import make_state, start
 from .state import FitState
 
@@ -56,7 +55,7 @@ def search(problem: Problem, run: Run) -> FitResult:
     clock, target = Clock(), problem.config.target_psnr
     assert target is not None
     trials: list[_Trial] = []
-    count: int | None = min(problem.num_gaussians, max(1, problem.image[0].numel() // _FIRST_SPACING))
+    count: int | None = min(problem.num_gaussians, max(1, problem.canvas[0].numel() // _FIRST_SPACING))
     while count is not None:
         budget = (problem.config.max_seconds or math.inf) - clock.seconds()
         trials.append(_fit(problem, count, trials, budget, run))
@@ -81,21 +80,15 @@ def _fit(problem: Problem, count: int, trials: list[_Trial], seconds: float, run
     settings = config.model_copy(update=changes)
     nearest = min(trials, key=lambda t: abs(math.log(t.num_gaussians / count)), default=None)
     problem = replace(problem, num_gaussians=count, config=settings)
-    densify = make_densify(settings)
-    if (
-        nearest is None
-        or nearest.result.stop_reason == "diverged"
-        or not isinstance(densify, Densify)
-        or not optimizer_kind(config).has_drafts
-    ):
+    if nearest is None or nearest.result.stop_reason == "diverged" or not optimizer_kind(problem).keeps_averages:
         state = start(problem)
     else:
-        state = _warm_start(problem, nearest.state, densify)
+        state = _warm_start(problem, nearest.state)
     result = run(state)
-    return _Trial(count, float(psnr(result.scene.render().to(problem.image), problem.image)), result, state)
+    return _Trial(count, float(psnr(result.scene.render().to(problem.canvas), problem.canvas)), result, state)
 
 
-def _warm_start(problem: Problem, finished: FitState, densify: Densify) -> FitState:
+def _warm_start(problem: Problem, finished: FitState) -> FitState:
     """Return the state of a fit that goes on from another with some Gaussians more or fewer."""
     count, field = problem.num_gaussians, copy.deepcopy(finished.field)
     state = make_state(
@@ -105,7 +98,7 @@ def _warm_start(problem: Problem, finished: FitState, densify: Densify) -> FitSt
     state.optimizer.load_state_dict(copy.deepcopy(finished.optimizer.state_dict()))
     remove_gaussians(state, state.num_gaussians - count)
     with torch.no_grad():
-        densify.add(state, count - state.num_gaussians)
+        add_gaussians(state, count - state.num_gaussians)
     return state
 
 

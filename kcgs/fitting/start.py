@@ -20,17 +20,15 @@ from .published.gradient_start import gradient_field
 from .state import FitState
 
 _INITIALIZERS = {"uniform": uniform_field, "random": random_field, "gradient": gradient_field}
-# of every value, where Gaussians start without an image
-_GREY = 0.5
 
 
 def start(problem: Problem) -> FitState:
     """Return the state of a fit at its start."""
-    image, config = problem.image, problem.config
+    image, config = problem.canvas, problem.config
     regions = _regions_to_render(image, _as_many_as_gaussians(problem), config)
     share = math.ceil(config.densify_from * problem.num_gaussians)
     count = min(problem.num_gaussians, max(1 if regions is None else regions.num_regions, share))
-    field = _INITIALIZERS[config.initializer](image.nan_to_num(_GREY), count, regions, problem.seed)
+    field = _INITIALIZERS[config.initializer](image, count, regions, problem.seed)
     return make_state(problem, field, regions, count, anchor=regions)
 
 
@@ -38,11 +36,11 @@ def make_state(
     problem: Problem, field: GaussianField, regions: RegionMap | None, num_initial: int, **progress: Any
 ) -> FitState:
     """Return the state of a fit of a field that began with so many Gaussians."""
-    config, optimizer = problem.config, optimizer_kind(problem.config)
-    cutoff = draft_cutoff(config.cutoff) if optimizer.has_drafts else config.cutoff
+    config, kind = problem.config, optimizer_kind(problem)
+    cutoff = draft_cutoff(config.cutoff) if kind.has_drafts else config.cutoff
     return FitState(
         field,
-        optimizer.make_optimizer(config, field, initial_sigma(problem.size, num_initial)),
+        kind.make_optimizer(config, field, initial_sigma(problem.size, num_initial)),
         problem.objective,
         Renderer(problem.size, regions, cutoff, config.backend, problem.bounds),
         problem=problem,
@@ -56,7 +54,7 @@ def _as_many_as_gaussians(problem: Problem) -> RegionMap | None:
     regions, count = problem.regions, problem.num_gaussians
     if regions is None or not problem.config.merge_regions or regions.num_regions <= count:
         return regions
-    return regions.merge(pairs_to_merge(problem.image, regions.labels, count))[0]
+    return regions.merge(pairs_to_merge(problem.canvas, regions.labels, count))[0]
 
 
 def _regions_to_render(image: Tensor, regions: RegionMap | None, config: FitConfig) -> RegionMap | None:

@@ -1,42 +1,25 @@
-"""The state of a fit: a descent, and what events read and change."""
+"""The state of a fit, and what happens to it when a scene was measured."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
-from operator import is_not
 from typing import NamedTuple
 
-import torch
-
 from kcgs.functional import RegionMap
-from kcgs.kernels import settle, without_waiting
-from kcgs.optim import FieldDescent, GaussianAdam
+from kcgs.optim import FieldState, is_within
 from kcgs.scene import Scene
 
-from .captured import CapturedStep
 from .problem import Problem
-from .readback import Readback
 from .result import HistoryEntry
 
-# at the start of a fit on a device that wait for it, since Gaussians may grow faster than the room for their lists
-_CHECKED_ITERATIONS = 20
-
-
-class Measurement(NamedTuple):
-    """A scene that was measured, until its errors have arrived from the device."""
-
-    iteration: int
-    seconds: float
-    scene: Scene  # a copy
-    errors: Readback
+# numbers beyond it are near overflow
+LARGEST = 1e15
 
 
 @dataclass(kw_only=True)
-class FitState(FieldDescent):
-    """A fit in progress: the start fills it, events change it, a checkpoint keeps it."""
+class FitState(FieldState):
+    """A fit in progress: the start fills it, events and steps change it, a checkpoint keeps it."""
 
     problem: Problem
     anchor: RegionMap | None
@@ -47,24 +30,17 @@ class FitState(FieldDescent):
     """Gaussians that the schedule last asked for; fewer exist where fewer were of use."""
     num_additions: int = 0
     """How often Gaussians were added."""
+    num_cycles: int = 0
+    """Cycles of removals and additions after their number has grown; 0: it grows."""
     num_late_moves: int = 0
     """How often contours moved after densification."""
     history: list[HistoryEntry] = field(default_factory=list)
-    pending: list[Measurement] = field(default_factory=list)
-    """Measurements whose errors are not in the history yet."""
-    magnitudes: Readback | None = None
-    """The largest absolute numbers of the field and its gradients some iterations ago, where the host runs ahead."""
-    lacks_room: bool = False
-    """A step on a device had no room for its lists."""
     best: Scene | None = None
     """A copy of the best scene that was measured."""
+    best_is_draft: bool = True
+    """The best was rendered with the cutoff of a draft, so every other scene is better."""
     best_value: float = math.inf
-    """Its squared error, or what the objective has in its place."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._first, self._captured = self.iteration, CapturedStep()
-        self._stepped: list[object] = []  # what the last step moved, and by what
+    """Squared error of the best, or value of the objective; see `Objective.is_ranked_by_psnr`."""
 
     @property
     def scene(self) -> Scene:
@@ -82,12 +58,9 @@ class FitState(FieldDescent):
         return self.renderer.cutoff != self.problem.config.cutoff
 
     @property
-    def runs_ahead(self) -> bool:
-        """True where a step waits for nothing, so that the host is some iterations before the device.
-
-        A step that the device had no room for has gradients of NaN, which GaussianAdam leaves out, and others do not.
-        """
-        return not self.problem.image.is_cpu and isinstance(self.optimizer, GaussianAdam)
+    def is_finite(self) -> bool:
+        """True where every number of the field is finite, and far from overflow."""
+        return is_within([self.field.means, self.field.cholesky, self.field.colors], LARGEST)
 
     @property
     def expected_iterations(self) -> float:
@@ -97,48 +70,40 @@ class FitState(FieldDescent):
             return config.num_iterations
         return self.iteration / max(self.progress, 1e-9)
 
-    def next_multiple(self, interval: int) -> float:
-        """Return the progress at this iteration, or the next that is a multiple of the interval, without a clock."""
-        return -(-self.iteration // interval) * interval / self.problem.config.max_iterations
+    def end_drafts(self) -> None:
+        """Render with the cutoff of the result from here on."""
+        self.renderer = self.renderer._replace(cutoff=self.problem.config.cutoff)
 
-    @property
-    def waits(self) -> bool:
-        """True where the next step waits for the device, which after an event counts how much room its lists take."""
-        content = self._content()
-        return self.lacks_room or len(content) != len(self._stepped) or any(map(is_not, content, self._stepped))
 
-    def _content(self) -> list[object]:
-        return [self.field.means, self.field.cholesky, self.field.colors, self.field.region_ids, self.renderer]
+class Measurement(NamedTuple):
+    """A scene that was rendered, and when."""
 
-    @property
-    def is_settled(self) -> bool:
-        """True where a render need not wait for the device."""
-        return self.runs_ahead and not self.waits and self.iteration >= self._first + _CHECKED_ITERATIONS
+    iteration: int
+    seconds: float
+    scene: Scene  # a copy, since the fit goes on
+    is_draft: bool
 
-    @property
-    def replays(self) -> bool:
-        """True where the next step is a kernel's programs alone, on a GPU, which a CUDA graph replays."""
-        return self.is_settled and self.field.means.is_cuda and self.objective.has_fused_gradients(self.renderer)
 
-    @contextmanager
-    def running_ahead(self) -> Iterator[None]:
-        """Render without waiting for the device, where that is possible, and without a graph that no step needs."""
-        with without_waiting() if self.is_settled else nullcontext(), torch.set_grad_enabled(not self.replays):
-            yield
+class Errors(NamedTuple):
+    """Mean errors of a render."""
 
-    def step(self, rate: float) -> None:
-        """Move the field once."""
-        if self.runs_ahead and self.waits:
-            settle(self.problem.image.device, self.problem.size)
-            self._captured.forget()
-        super().step(rate)
-        self._stepped, self.lacks_room = self._content(), False
+    objective: float
+    squared: float  # once it is clipped to [0, 1]; NaN without an image
+    squared_near_contours: float  # the same in the band of EF-PSNR; NaN without contours
 
-    def move(self) -> None:
-        """Take a step, or replay one."""
-        with self.running_ahead():
-            if self.replays:
-                self.rendered = None
-                self._captured(self)
-            else:
-                super().move()
+
+def record(state: FitState, measurement: Measurement, errors: Errors) -> None:
+    """Put a measurement into the history, and keep its scene if it is the best; one of NaN does not count."""
+    iteration, seconds, scene, is_draft = measurement
+    if math.isnan(errors.objective):
+        return
+    psnr, ef_psnr = _decibel(errors.squared), _decibel(errors.squared_near_contours)
+    state.history.append(HistoryEntry(iteration, seconds, errors.objective, psnr, ef_psnr, scene.num_gaussians))
+    value = errors.squared if state.objective.is_ranked_by_psnr else errors.objective
+    if (is_draft, value) < (state.best_is_draft, state.best_value):
+        state.best, state.best_is_draft, state.best_value = scene, is_draft, value
+
+
+def _decibel(mean_square: float) -> float:
+    """PSNR of a mean squared error, for values in [0, 1]."""
+    return math.inf if mean_square == 0 else -10.0 * math.log10(mean_square)

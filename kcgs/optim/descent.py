@@ -15,7 +15,7 @@ from .objectives import Objective
 
 
 @dataclass
-class FieldDescent:
+class FieldState:
     """A field that an optimizer moves; events may replace the map, and add and remove Gaussians."""
 
     field: GaussianField
@@ -25,8 +25,7 @@ class FieldDescent:
     renderer: Renderer
     iteration: int = 0
     progress: float = 0.0
-    rendered: Tensor | None = None
-    """The render before the next step, with its graph, where an event has left it."""
+    """Share of the descent that is over."""
 
     def __post_init__(self) -> None:
         for group in self.optimizer.param_groups:
@@ -50,16 +49,28 @@ class FieldDescent:
         """Render (C, H, W), with a graph."""
         return self.renderer.render(self.gaussians)
 
-    def step(self, rate: float) -> None:
-        """Move the field once, and count the iteration."""
-        for group in self.optimizer.param_groups:
-            group["lr"] = group["initial_lr"] * rate
-        self.move()
-        self.iteration += 1
 
-    def move(self) -> None:
-        """Take a step of the optimizer by the gradients of the objective; colours are without opacities."""
-        field, rendered, self.rendered = self.field, self.rendered, None
-        gradients = self.objective.gradients(self.renderer, self.gaussians, rendered)
-        field.means.grad, field.cholesky.grad, field.colors.grad = gradients[:3]
-        self.optimizer.step()
+def set_rates(state: FieldState, factor: float) -> None:
+    """Set the learning rates to those of the start, times a factor."""
+    for group in state.optimizer.param_groups:
+        group["lr"] = group["initial_lr"] * factor
+
+
+def move_field(state: FieldState, rendered: Tensor | None = None) -> None:
+    """Take a step of the optimizer by the gradients of the objective; colours are without opacities.
+
+    Args:
+        state: of the field.
+        rendered: its render, with a graph, where there is one already.
+    """
+    field = state.field
+    gradients = state.objective.gradients(state.renderer, state.gaussians, rendered)
+    field.means.grad, field.cholesky.grad, field.colors.grad = gradients[:3]
+    state.optimizer.step()
+
+
+def step_field(state: FieldState, rate: float, rendered: Tensor | None = None) -> None:
+    """Move a field once, by a factor of the learning rates, and count the iteration."""
+    set_rates(state, rate)
+    move_field(state, rendered)
+    state.iteration += 1

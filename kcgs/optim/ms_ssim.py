@@ -12,7 +12,7 @@ from torch.nn.functional import pad
 from kcgs.functional import K1, K2, SCALE_WEIGHTS, SSIM_SIGMA, SSIM_WINDOW, window_mean
 
 from .gaussians import Gaussians
-from .objectives import Objective, Residual
+from .objectives import AbsoluteError, ImageObjective, Residual, SquaredError
 
 if TYPE_CHECKING:
     from .similarity import Passes
@@ -24,7 +24,7 @@ _SQUARED_REDUCED = 0.03
 _MIN_SCORE = 0.2
 
 
-class MsSsim(Objective):
+class MsSsim(ImageObjective):
     r"""What MS-SSIM lacks, as its logarithm, and a little of the squared error.
 
     .. math:: E(r) = -\sum_k w_k \log \overline{s_k} / Z + 0.003 |r|^2, \quad
@@ -168,6 +168,10 @@ class MsSsim(Objective):
             blocks = fine[:, : 2 * height, : 2 * width].unflatten(2, (width, 2)).unflatten(1, (height, 2))
             blocks.add_(coarse[:, :, None, :, None])
         return planes[0]
+
+
+# by the names that settings have
+OBJECTIVES: dict[str, type[ImageObjective]] = {"l2": SquaredError, "l1": AbsoluteError, "ms-ssim": MsSsim}
 
 
 def _blur(maps: Tensor) -> Tensor:

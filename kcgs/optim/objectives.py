@@ -28,21 +28,16 @@ class Residual(NamedTuple):
 
 
 class Objective(ABC):
-    """An error of a render; subclasses say of which kind.
-
-    Args:
-        image: (C, H, W), what the render should be.
-    """
+    """What a descent lowers: a function of the render, with its slope."""
 
     is_ranked_by_psnr = True
     """The best state of a descent has the highest PSNR; False: the lowest value."""
-
-    def __init__(self, image: Tensor) -> None:
-        self.image = image
+    power: int | None = None
+    """The value is the mean of this power of the absolute difference from the image; None: it is not such a mean."""
 
     @abstractmethod
     def slope(self, render: Tensor) -> Tensor:
-        """Return half the gradient at a render, (C, H, W), in whose memory it may be.
+        """Return half the gradient at a render, (C, H, W), whose memory this method may overwrite.
 
         Adam ignores a constant factor. Newton's method takes half of the squared error's.
         """
@@ -51,13 +46,13 @@ class Objective(ABC):
     def value(self, render: Tensor) -> Tensor:
         """Return the mean error of a render, (C, H, W), as a scalar on its device."""
 
+    @abstractmethod
+    def residual(self, render: Tensor) -> Residual:
+        """Return what a render, (C, H, W), lacks."""
+
     def weigh(self, gaussians: Gaussians) -> Tensor:
         """Return about what the squared error of each Gaussian weighs, (N,)."""
         return torch.ones_like(gaussians.means[:, 0])
-
-    def residual(self, render: Tensor) -> Residual:
-        """Return what a render, (C, H, W), lacks."""
-        return Residual(self.image - render)
 
     def has_fused_gradients(self, renderer: Renderer) -> bool:
         """Whether gradients need no render of their own."""
@@ -74,12 +69,24 @@ class Objective(ABC):
         return Gaussians(*torch.autograd.grad(render, leaves[:3], self.slope(render.data)))
 
 
-class SquaredError(Objective):
+class ImageObjective(Objective):
+    """An error of a render against an image, (C, H, W); subclasses say of which kind."""
+
+    def __init__(self, image: Tensor) -> None:
+        self.image = image
+
+    def residual(self, render: Tensor) -> Residual:
+        """Return the difference of the image from a render."""
+        return Residual(self.image - render)
+
+
+class SquaredError(ImageObjective):
     """The squared error, with a weight of each pixel, (H, W), if there is one."""
 
     def __init__(self, image: Tensor, weight: Tensor | None = None) -> None:
         super().__init__(image)
         self.weight = weight
+        self.power = 2 if weight is None else None
 
     def slope(self, render: Tensor) -> Tensor:
         """Return the difference, in the memory of the render: new memory would take as long as the sum."""
@@ -103,8 +110,10 @@ class SquaredError(Objective):
         return super().gradients(renderer, gaussians, render)
 
 
-class AbsoluteError(Objective):
+class AbsoluteError(ImageObjective):
     """The mean absolute error."""
+
+    power: int | None = 1
 
     def slope(self, render: Tensor) -> Tensor:
         """Return the sign of the difference."""
@@ -120,15 +129,13 @@ class LossObjective(Objective):
 
     Args:
         loss: from a render, (1, C, H, W), to a scalar.
-        image: (C, H, W), whose difference from the render is where Gaussians are added.
-        has_image: False: the loss says where.
+        image: (C, H, W). Gaussians are added where the render differs from it; None: where the loss has its slope.
     """
 
     is_ranked_by_psnr = False
 
-    def __init__(self, loss: Loss, image: Tensor, has_image: bool = True) -> None:
-        super().__init__(image)
-        self.loss, self.has_image = loss, has_image
+    def __init__(self, loss: Loss, image: Tensor | None = None) -> None:
+        self.loss, self.image = loss, image
 
     def slope(self, render: Tensor) -> Tensor:
         """Return the gradient, times the number of values, as if the loss were their mean."""
@@ -149,8 +156,8 @@ class LossObjective(Objective):
 
         The longest that is tried changes one value by 1.
         """
-        if self.has_image:
-            return super().residual(render)
+        if self.image is not None:
+            return Residual(self.image - render)
         slope = self.slope(render)
         steps = [slope * (-(0.5**k) / slope.abs().max()) for k in range(_NUM_STEPS)]
         return Residual(min(steps, key=lambda step: float(self.value(render + step))))

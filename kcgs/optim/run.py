@@ -16,41 +16,40 @@ class Descent(Protocol):
     iteration: int
     progress: float  # share of the descent that is over
 
-    def step(self, rate: float) -> None:
-        """Move them once, and count the iteration; `rate` is a share of the stepper's own."""
-
 
 @runtime_checkable
 class Event(Protocol):
     """Something that happens to descents of some kind from time to time."""
 
-    def due(self, descent: Any) -> float:
-        """Return the progress from which on it acts next; asked at the start, and each time it has acted."""
-
     def act(self, descent: Any) -> str | None:
-        """Change or observe the descent; return why it ends here, or None."""
+        """Change or observe the descent, if it is time to; return why the descent ends here, or None.
+
+        Called before every step, so an event knows itself when it acts.
+        """
 
 
 def run(
-    descent: Descent, progress: Callable[[], float], events: Sequence[Event], rate: Callable[[float], float]
+    descent: Descent,
+    step: Callable[[float], None],
+    progress: Callable[[], float],
+    events: Sequence[Event],
+    rate: Callable[[float], float],
 ) -> str:
-    """Step until an event gives a reason to end; return the reason.
+    """Let events act and step, until an event gives a reason to end; return the reason.
 
     Args:
         descent: what moves.
+        step: moves it once, by a share of the largest step, and counts the iteration.
         progress: share of the descent that is over, from 0 to 1.
-        events: act before a step, in this order, if they are due.
+        events: act before a step, in this order.
         rate: of the steps, by progress.
     """
-    due = [event.due(descent) for event in events]
     while True:
         descent.progress = progress()
-        for k, event in enumerate(events):
-            if descent.progress >= due[k]:
-                if reason := event.act(descent):
-                    return reason
-                due[k] = event.due(descent)
-        descent.step(rate(descent.progress))
+        for event in events:
+            if reason := event.act(descent):
+                return reason
+        step(rate(descent.progress))
 
 
 def count_iterations(descent: Descent, iterations: float) -> Callable[[], float]:
@@ -64,13 +63,9 @@ class End:
     def __init__(self, until: float = 1.0, reason: Callable[[], str] = lambda: "iterations") -> None:
         self.until, self.reason = until, reason
 
-    def due(self, descent: Descent) -> float:
-        """See :class:`Event`."""
-        return self.until
-
     def act(self, descent: Descent) -> str | None:
         """See :class:`Event`."""
-        return self.reason()
+        return self.reason() if descent.progress >= self.until else None
 
 
 class TimedAction:
@@ -78,14 +73,13 @@ class TimedAction:
 
     def __init__(self, times: Iterable[float], action: Callable[[], None]) -> None:
         self._times, self._action = iter([*times, math.inf]), action
-
-    def due(self, descent: Descent) -> float:
-        """See :class:`Event`."""
-        return next(self._times)
+        self._next = next(self._times)
 
     def act(self, descent: Descent) -> None:
         """See :class:`Event`."""
-        self._action()
+        if descent.progress >= self._next:
+            self._action()
+            self._next = next(self._times)
 
 
 def cosine_decay(progress: float) -> float:

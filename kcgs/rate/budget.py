@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_count
+from kcgs._objectives import ObjectiveName
 from kcgs._progress import Progress
 from kcgs._repr import brief
 from kcgs.codec import SceneWriter, decode, encode_region_map
@@ -21,6 +22,7 @@ from kcgs.fitting import FitConfig, FitResult, HistoryEntry, Problem, fit_proble
 from kcgs.functional import RegionMap, edge_band, merge_regions
 from kcgs.maps import contour_edges, pairs_to_merge
 from kcgs.nn import GaussianField, area_mean, scaled_gaussians
+from kcgs.optim import ImageObjective
 from kcgs.scene import Scene
 
 from .compress import Compressor
@@ -101,8 +103,8 @@ class FitBytesSettings:
 
 
 # MS-SSIM suffers more from rounding than from fewer Gaussians, and people from stray strokes
-BUDGETS = {
-    "psnr": GaussianBudget(),
+BUDGETS: dict[ObjectiveName, GaussianBudget] = {
+    "l2": GaussianBudget(),
     "ms-ssim": GaussianBudget(
         bits_per_gaussian=28.5,
         min_bits_per_gaussian=29.0,
@@ -170,13 +172,14 @@ def fit_bytes(
         progress: as there.
         settings: as there; `contour_cost` is replaced by the coder's, and `max_seconds` is for the fit alone. Without
             it the rate-distortion descent replaces the last iterations, 11 or 15 %. A fit has 500 iterations, 350 on a
-            reduced photo, 700 with the objective psnr.
+            reduced photo, 700 with the objective l2.
 
     Returns:
         The file, the scene that it decodes to, and the fit.
 
     Raises:
-        TypeError, ValueError: as :func:`kcgs.fit`; `target_bytes` below 40, or too small for a map that is to be kept.
+        TypeError, ValueError: as :func:`kcgs.fit`; `target_bytes` below 40, or too small for a map that is to be kept;
+            an objective that is neither l2 nor ms-ssim, such as that of a recipe.
 
     Example:
         >>> import torch
@@ -186,33 +189,30 @@ def fit_bytes(
         (True, None)
     """
     config = FitConfig.from_recipe(recipe, **settings)
-    if config.objective == "auto":
-        config = config.model_copy(update={"objective": "ms-ssim" if config.loss == "l2" else "psnr"})
     if config.target_psnr is not None:
         raise InvalidArgument("target_psnr", "None with target_bytes", config.target_psnr)
-    if callable(config.objective):
-        raise InvalidArgument("objective", "'psnr' or 'ms-ssim' with target_bytes", "a function")
     check_count("target_bytes", target_bytes, _MIN_BYTES)
-    problem = make_problem(image, regions, 1, config, seed)
-    with Progress("trial fits", pulse=True, visible=progress), threads_for_kernels(problem.image[0].numel()):
+    problem = make_problem(image, regions, 1, config, seed, purpose="file")
+    with Progress("trial fits", pulse=True, visible=progress), threads_for_kernels(problem.canvas[0].numel()):
         choice = _choose_regions(problem, target_bytes)
     reduced = _reduce(problem, choice)
     share = _SETTINGS.fit_share if choice.regions is None else _SETTINGS.fit_share_with_regions
     result = _fit_share(share, reduced, on_step, progress)
     scene = _enlarge(result.scene, problem.size)
     report = report_regions(problem.regions, scene, **choice.changes)
-    with Progress("writing the file", pulse=True, visible=progress), threads_for_kernels(reduced.image[0].numel()):
-        small = reduced.image.to("cpu", torch.float32)
-        objective = replace(reduced, image=small).objective
+    with Progress("writing the file", pulse=True, visible=progress), threads_for_kernels(reduced.canvas[0].numel()):
+        objective = replace(reduced, canvas=reduced.canvas.to("cpu", torch.float32)).objective
+        assert isinstance(objective, ImageObjective)
         min_sigma = _min_sigma(problem, choice.num_gaussians)
-        iterations = _shorten(_budget(config).compress_iterations, reduced.reduction)
+        iterations = _shorten(_budget(problem.config).compress_iterations, reduced.reduction)
         compressor = Compressor(SceneWriter(scene), objective, iterations, seed, min_sigma)
         data = compressor.search_bytes(target_bytes)
     return FitBytesResult(data, decode(data).scene, result._replace(scene=scene, regions=report))
 
 
 def _budget(config: FitConfig) -> GaussianBudget:
-    return BUDGETS[str(config.objective)]
+    assert config.objective is not None
+    return BUDGETS[config.objective]
 
 
 def _reduce(problem: Problem, choice: _RegionChoice) -> Problem:
@@ -225,7 +225,7 @@ def _reduce(problem: Problem, choice: _RegionChoice) -> Problem:
         update["iterations"] = _shorten(budget.fit_iterations, reduction)
     config = config.model_copy(update=update)
     return replace(
-        problem, image=area_mean(problem.image, (-(-height // reduction), -(-width // reduction))),
+        problem, canvas=area_mean(problem.canvas, (-(-height // reduction), -(-width // reduction))),
         regions=choice.regions, num_gaussians=choice.num_gaussians, config=config, reduction=reduction,
     )  # fmt: skip
 
@@ -256,7 +256,7 @@ def _enlarge(scene: Scene, size: tuple[int, int]) -> Scene:
 
 def _choose_regions(problem: Problem, target_bytes: int) -> _RegionChoice:
     """Merge regions whose contours do not pay for their bytes, then drop the map if it does not pay as a whole."""
-    image, regions, config = problem.image, problem.regions, problem.config
+    image, regions, config = problem.canvas, problem.regions, problem.config
     num_gaussians = partial(_budget(config).num_gaussians, pixels=image.shape[1] * image.shape[2])
     choice = _RegionChoice(None, num_gaussians(target_bytes), config.contour_cost, {})
     if not config.guidance:
@@ -271,7 +271,7 @@ def _choose_regions(problem: Problem, target_bytes: int) -> _RegionChoice:
     # by iterations, so that without a clock the same arguments give the same file
     iterations = min(_SETTINGS.trial_iterations, config.num_iterations)
     trial_config = FitConfig.from_recipe(
-        config, merge_regions=False, iterations=iterations, max_seconds=None, objective="psnr"
+        config, merge_regions=False, iterations=iterations, max_seconds=None, objective="l2"
     )
     trial = replace(problem, config=trial_config)
 

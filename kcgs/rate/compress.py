@@ -5,19 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import torch
 
 from kcgs._check import check_count, check_number
 from kcgs._image import as_image
+from kcgs._objectives import check_objective, objective_for
 from kcgs._repr import brief
 from kcgs.codec import QPS, QUALITIES, Quantizer, SceneWriter, decode
 from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
-from kcgs.fitting import ObjectiveName
 from kcgs.functional import psnr
-from kcgs.optim import End, MsSsim, Objective, SquaredError, TimedAction, count_iterations, run
+from kcgs.optim import OBJECTIVES, End, ImageObjective, TimedAction, count_iterations, run
 from kcgs.scene import Scene
 
 from .descent import RATE, RateDistortionDescent
@@ -49,7 +49,7 @@ def compress(
     target_psnr: float | None = None,
     iterations: int = 600,
     seed: int = 0,
-    objective: str = "auto",
+    objective: str | None = None,
 ) -> Compressed:
     """Write a scene as a `.kcgs` file with the least error against its image.
 
@@ -67,7 +67,7 @@ def compress(
             the scene itself does not, a file that is nearly as good as the scene.
         iterations: renders that descent and rounding may take, at least 1.
         seed: of the order in which Gaussians are rounded.
-        objective: of the descent, psnr or ms-ssim, as in :class:`kcgs.FitConfig`; auto: psnr with `target_psnr`, else
+        objective: of the descent, l2 or ms-ssim, as in :class:`kcgs.FitConfig`. None: l2 with `target_psnr`, else
             ms-ssim.
 
     Returns:
@@ -96,12 +96,8 @@ def compress(
             raise InvalidArgument("target_psnr", "None with quality or target_bytes", target_psnr)
     qp = writer.qp_for(quality, target_bytes)
     check_count("iterations", iterations)
-    if objective not in get_args(ObjectiveName):
-        raise InvalidArgument("objective", f"one of {', '.join(get_args(ObjectiveName))}", repr(objective))
-    if objective == "auto":
-        objective = "ms-ssim" if target_psnr is None else "psnr"
-    error = MsSsim(target) if objective == "ms-ssim" else SquaredError(target)
-    compressor = Compressor(writer, error, iterations, seed)
+    name = objective_for("file" if target_psnr is None else "file of a PSNR", check_objective(objective))
+    compressor = Compressor(writer, OBJECTIVES[name](target), iterations, seed)
     with threads_for_kernels(target[0].numel()):
         if target_bytes is not None:
             data = compressor.search_bytes(target_bytes)
@@ -166,7 +162,7 @@ class Compressor:
     """Rate-distortion descent and gradual rounding of one scene, at any quantization parameter (QP)."""
 
     writer: SceneWriter
-    objective: Objective  # of an image of the scene's size, or smaller
+    objective: ImageObjective  # of an image of the scene's size, or smaller
     iterations: int
     seed: int
     min_sigma: float = 0.0
@@ -248,7 +244,7 @@ class Compressor:
 
         progress = count_iterations(descent, iterations)
         times = [k / iterations for k in range(0, iterations, _SCHEDULE.update_interval)]
-        run(descent, progress, [End(), TimedAction(times, update)], lambda progress: RATE)
+        run(descent, descent.step, progress, [End(), TimedAction(times, update)], lambda progress: RATE)
         return writer.with_gaussians(descent.parameters(), descent.ids) if iterations else writer, qp
 
     def _round(self, writer: SceneWriter, qp: int, iterations: int, max_bytes: float = math.inf) -> bytes:

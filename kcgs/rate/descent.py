@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs.codec import Parameters, Quantizer, SceneWriter
-from kcgs.optim import Gaussians, NewtonDescent, Objective, Renderer, self_product
+from kcgs.optim import Gaussians, ImageObjective, NewtonDescent, Renderer, self_product
 
 from .bits import soft_bits
 
@@ -41,7 +41,7 @@ class RateDistortionDescent(NewtonDescent):
     quantizer: Quantizer
     """Of the file, at the moment."""
 
-    def __init__(self, writer: SceneWriter, objective: Objective, min_sigma: float = 0.0) -> None:
+    def __init__(self, writer: SceneWriter, objective: ImageObjective, min_sigma: float = 0.0) -> None:
         image, (height, width) = objective.image, writer.size
         size = image.shape[1], image.shape[2]
         scale = image.new_tensor([size[1] / width, size[0] / height])
@@ -51,6 +51,7 @@ class RateDistortionDescent(NewtonDescent):
         renderer = Renderer(size, writer.regions)
         # steps are so short that the first order of the shear is enough
         super().__init__(gaussians, objective, renderer, exact=False, min_sigma=min_sigma)
+        self._image = image
         self._error_weights = self._weigh(self.gaussians)
         self._error_scale = float(self._error_weights.mean())
         self._bit_gradient: Gaussians | None = None
@@ -69,7 +70,7 @@ class RateDistortionDescent(NewtonDescent):
             color_mask: Gaussians whose colour is rounded, bool (N,).
         """
         masks = Gaussians(shape_mask[:, None], shape_mask[:, None], color_mask[:, None])
-        self._rounded = masks, self._as_tensors(values, self.objective.image)
+        self._rounded = masks, self._as_tensors(values, self._image)
         frozen = masks.cholesky.expand(-1, 5), masks.colors.expand(-1, self.gaussians.colors.shape[1])
         self.frozen = torch.cat(frozen, -1)
 

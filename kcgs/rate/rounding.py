@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 
 from kcgs.codec import Classes, Codes
-from kcgs.optim import End, TimedAction, count_iterations, run
+from kcgs.optim import End, Event, TimedAction, count_iterations, run
 
 from .descent import RATE, RateDistortionDescent
 
@@ -20,8 +20,8 @@ _SHAPE_SHARE = 0.65
 _GROUP_INTERVAL = 3
 # bytes of one of the weakest Gaussians, as a share of the mean
 _WEAK_SHARE = 0.75
-# shares of the iterations after which Gaussians are removed if the file is too large: early enough that the others
-# correct the error
+# shares of the iterations; before the next group Gaussians are removed if the file is too large: early enough that the
+# others correct the error
 _SIZE_CHECKS = (0.3, 0.65, 0.9)
 
 
@@ -45,8 +45,10 @@ def round_gradually(
         max_bytes: largest size of the file, unless one Gaussian alone takes more.
     """
     rounding = _Rounding(descent, write, seed, max_bytes)
-    groups = TimedAction([k / iterations for k in range(0, iterations, _GROUP_INTERVAL)], rounding.round_group)
-    run(descent, count_iterations(descent, iterations), [End(), groups], lambda progress: RATE)
+    times = [k / iterations for k in range(0, iterations, _GROUP_INTERVAL)]
+    checks = [min((time for time in times if time >= share), default=math.inf) for share in _SIZE_CHECKS]
+    events: list[Event] = [End(), TimedAction(checks, rounding.check_size), TimedAction(times, rounding.round_group)]
+    run(descent, descent.step, count_iterations(descent, iterations), events, lambda progress: RATE)
     while len(data := write(rounding.codes())) > max_bytes and len(descent.ids) > 1:
         rounding.remove_excess(len(data))
     return data
@@ -61,23 +63,22 @@ class _Rounding:
         self.descent, self.write, self.max_bytes = descent, write, max_bytes
         self.order = torch.rand(2, len(descent.ids), generator=torch.Generator().manual_seed(seed))
         self.classes = descent.quantizer.classify(descent.parameters())
-        self.checks = [*_SIZE_CHECKS, math.inf]
 
     def codes(self) -> Codes:
         """Round all Gaussians as they are."""
         return self.descent.quantizer.quantize(self.descent.parameters(), self.classes)
 
+    def check_size(self) -> None:
+        """Remove Gaussians if the file is too large."""
+        if self.max_bytes < math.inf:
+            self.remove_excess(len(self.write(self.codes())))
+
     def round_group(self) -> None:
-        """Round the Gaussians whose turn it is; where the file is too large, remove some before."""
+        """Round the Gaussians whose turn it is."""
         descent, progress = self.descent, self.descent.progress
-        codes = self.codes()
-        if progress >= self.checks[0] and self.max_bytes < math.inf:
-            self.checks.pop(0)
-            self.remove_excess(len(self.write(codes)))
-            codes = self.codes()
         shape_mask = self.order[0] < progress / _SHAPE_SHARE
         color_mask = self.order[1] < (progress - _SHAPE_SHARE) / (1 - _SHAPE_SHARE)
-        descent.round(descent.quantizer.dequantize(codes), shape_mask, color_mask)
+        descent.round(descent.quantizer.dequantize(self.codes()), shape_mask, color_mask)
 
     def remove_excess(self, size: int) -> None:
         """Remove the weakest Gaussians of a file of so many bytes, if those are too many."""

@@ -11,13 +11,12 @@ from torch import Tensor
 from kcgs.fitting import FitConfig, lowest_weighted_impact, move_contours, propose_for
 from kcgs.functional import RegionMap
 from kcgs.optim import (
+    OBJECTIVES,
     End,
     Event,
     Gaussians,
-    MsSsim,
     NewtonDescent,
     Renderer,
-    SquaredError,
     TimedAction,
     count_iterations,
     draft_cutoff,
@@ -59,7 +58,7 @@ class FrameDescent(NewtonDescent):
     Args:
         image: (C, H, W).
         scene: the start.
-        config: of the fit.
+        config: of the fit, with an objective.
         movable_rows: Gaussians that may move, bool (N,).
         changed_pixels: where Gaussians may be relocated to, bool (H, W).
     """
@@ -67,7 +66,8 @@ class FrameDescent(NewtonDescent):
     def __init__(
         self, image: Tensor, scene: Scene, config: FitConfig, movable_rows: Tensor, changed_pixels: Tensor
     ) -> None:
-        objective = MsSsim(image) if config.objective == "ms-ssim" else SquaredError(image)
+        assert config.objective is not None
+        objective = OBJECTIVES[config.objective](image)
         super().__init__(Gaussians.of(scene.field), objective, renderer_of(scene, config), min_sigma=_MIN_SIGMA)
         self.image, self.start, self.config = image, scene, config
         self.movable_rows, self.changed_pixels = movable_rows, changed_pixels
@@ -93,7 +93,8 @@ class FrameDescent(NewtonDescent):
         if anchor is not None:
             events.append(TimedAction([_CONTOUR_ITERATION / _ITERATIONS], partial(self._move_contours, anchor)))
         final = (_ITERATIONS - _FINAL_ITERATIONS) / _ITERATIONS
-        run(self, count_iterations(self, _ITERATIONS), events, lambda p: _RATE if p < final else 0.5 * _RATE)
+        progress = count_iterations(self, _ITERATIONS)
+        run(self, self.step, progress, events, lambda p: _RATE if p < final else 0.5 * _RATE)
         return self.scene if self.squared_error() <= before else self.start
 
     def squared_error(self) -> float:

@@ -51,9 +51,9 @@ def delete_from_video(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
     """
     regions, row_ids, deleted_ids = _check(scenes, region_ids)
     deleted_pixels, deleted_rows = torch.isin(regions.labels, deleted_ids), torch.isin(row_ids, deleted_ids)
-    # scenes don't keep the config of their fit; of it a descent uses the backend, the cutoff and the objective, whose
-    # defaults suit every scene
-    config, frames = FitConfig(), list[Scene]()
+    # scenes don't keep the config of their fit; of it a descent uses the backend and the cutoff, whose defaults suit
+    # every scene, and the objective
+    config, frames = FitConfig(objective="l2"), list[Scene]()
     with threads_for_kernels(scenes.size[0] * scenes.size[1]):
         motions = affine_motions(scenes.field.means.detach(), ~deleted_rows)
         images, labels = restore_background(scenes.render(), regions.labels, deleted_pixels, motions)

@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
 from kcgs._check import check_count
+from kcgs._objectives import objective_for
 from kcgs._progress import Progress
 from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
@@ -86,7 +87,8 @@ def fit_video(
 
     Raises:
         TypeError: wrong types.
-        ValueError: as :func:`kcgs.fit`; no frames; a frame of another size, or without a label map.
+        ValueError: as :func:`kcgs.fit`; an objective that is neither l2 nor ms-ssim, such as a recipe's; no frames;
+            a frame of another size, or without a label map.
 
     Example:
         >>> frames = [torch.zeros(3, 16, 24) for _ in range(3)]
@@ -97,8 +99,7 @@ def fit_video(
         (3, 8, torch.Size([3, 3, 16, 24]))
     """
     config = FitConfig.from_recipe(recipe, **({"merge_regions": False} | settings))
-    if callable(config.objective):
-        raise InvalidArgument("objective", "a name: frames differ", "a function")
+    config = config.model_copy(update={"objective": objective_for("video", config.objective)})
     video = _VideoFit(config, check_count("num_gaussians", num_gaussians), seed)
     length = len(frames) if isinstance(frames, Sized) else None
     with Progress("fit-video", pulse=length is None, visible=progress) as bar:

@@ -7,7 +7,7 @@ import logging
 import signal
 import sys
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import pytest
 import torch
@@ -16,9 +16,7 @@ from PIL import Image
 from kcgs import GaussianField, Scene, fit, load
 from kcgs.cli import demo
 from kcgs.cli.common import InterruptHandler
-from kcgs.cli.options import Objective
 from kcgs.data import load_image, load_labels, save_labels
-from kcgs.fitting import ObjectiveName
 from kcgs.functional import psnr
 from kcgs.segment import segment
 from tests.cli.conftest import Kcgs
@@ -107,9 +105,11 @@ class TestFit:
         assert report["num_gaussians"] == load("photo.kcgs").num_gaussians
         assert report["bits_per_pixel"] == pytest.approx(8 * report["bytes"] / (40 * 60))
 
-    def test_objectives_are_those_of_fits(self) -> None:
-        choices, _ = get_args(get_args(Objective)[0])  # of Annotated[Literal[...] | None, ...]
-        assert get_args(choices) == get_args(ObjectiveName)
+    def test_a_file_lowers_what_the_fit_does(self, kcgs: Kcgs) -> None:
+        """L1 it cannot lower, and says so before the fit."""
+        code, _, err = kcgs(*FIT[:-1], "photo.kcgs", "--recipe", "paper")
+        assert code == 2 and "must be ms-ssim or l2 for a file; got 'l1'" in err
+        assert kcgs(*FIT[:-1], "photo.kcgs", "--recipe", "paper", "--objective", "l2").code == 0
 
     def test_interrupt_saves_the_best_so_far(self, kcgs: Kcgs, monkeypatch: pytest.MonkeyPatch) -> None:
         def interrupt_third_step(handler: InterruptHandler, iteration: int, entry: Any) -> bool:
@@ -182,7 +182,8 @@ class TestFailures:
             (("fit", "photo.png", "b.png"), 2, "extra argument(s) (b.png)"),
             (("fit", "photo.png", "-n", "0"), 2, "greater than or equal to 1"),
             (("fit", "photo.png", "-n", "10000"), 2, "must be at most 2400, the pixels of the 60 x 40 image"),
-            (("fit", "photo.png", "--objective", "visual"), 2, "'visual' is not one of"),
+            (("fit", "photo.png", "--objective", "visual"), 2, "one of l2, l1, ms-ssim, l1+ssim; got 'visual'"),
+            (("fit", "photo.png", "--objective", "psnr"), 2, "got 'psnr', which is now 'l2'"),
             (("fit", "nothing.png"), 2, "nothing.png"),
             (("fit", "text.png"), 1, "text.png"),
             (("fit", "photo.png", "--recipe", "none-such"), 2, "'--recipe': must be one of"),
@@ -206,7 +207,7 @@ class TestFailures:
             (("info", "nothing.kcgs"), 2, "kcgs: No such file or directory: nothing.kcgs"),
             (("decode", "nothing.kcgs", "-o", "a.png"), 2, "kcgs: No such file or directory: nothing.kcgs"),
             (("encode", "zoo:chart-pie", "-o", "a.kcgs", "--quality", "500"), 2, "'--quality': must be in [10, 90]"),
-            (("encode", "zoo:chart-pie", "-o", "a.kcgs", "--objective", "psnr"), 2, "left out with a scene without"),
+            (("encode", "zoo:chart-pie", "-o", "a.kcgs", "--objective", "l2"), 2, "left out with a scene without"),
             (("segment", "photo.png", "-o", "a.png", "--method", "magic"), 2, "'--method': must be one of"),
             ((*RENDER, "--device", "cuda"), 2, "No such option: --device, which is one of kcgs fit, kcgs fit-many"),
             ((*RENDER, "--size", "90"), 2, "'--size': must be WxH"),

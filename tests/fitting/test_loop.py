@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+import tomllib
 from itertools import pairwise
 
 import pytest
@@ -99,6 +101,15 @@ class TestSettings:
         with pytest.raises(TypeError, match="recipe must be a name or a FitConfig; got dict"):
             fit(image, labels, 5, recipe={})  # type: ignore[arg-type]
 
+    @pytest.mark.parametrize("recipe", available_recipes())
+    def test_all_values_are_plain(self, recipe: str) -> None:
+        """Settings go through JSON and TOML and back, and so does a fit's whole config."""
+        image, labels = disc()
+        for config in (quick(recipe), fit(image, labels, 5, recipe=quick(recipe, iterations=1)).config):
+            toml = "\n".join(f"{k} = {json.dumps(v)}" for k, v in config.model_dump(exclude_none=True).items())
+            assert FitConfig(**tomllib.loads(toml)) == config
+            assert FitConfig.model_validate_json(config.model_dump_json()) == config
+
     def test_arrays_and_pil_images(self) -> None:
         from PIL import Image
 
@@ -182,11 +193,11 @@ class TestSwitches:
         for outside, clipped in ((2.0, [2.0, 1.0, 2.0, 2.0]), (-1.0, [0.0, -1.0, -1.0, -1.0])):
             assert torch.equal(torch.full((1, 6, 4), outside).clamp(*bounds), torch.tensor(clipped).expand(1, 6, 4))
 
-    @pytest.mark.parametrize("loss", ["l1", "l2"])
+    @pytest.mark.parametrize("objective", ["l1", "l2"])
     @pytest.mark.parametrize("optimizer", ["adam", "adan"])
-    def test_losses_and_optimizers(self, loss: str, optimizer: str) -> None:
+    def test_objectives_and_optimizers(self, objective: str, optimizer: str) -> None:
         image, labels = disc()
-        result = fit(image, labels, 12, recipe=quick(loss=loss, optimizer=optimizer, iterations=300))
+        result = fit(image, labels, 12, recipe=quick(objective=objective, optimizer=optimizer, iterations=300))
         assert result.history[-1].psnr > 24
 
     def test_softness_of_the_map_or_the_recipe(self) -> None:
@@ -227,7 +238,7 @@ class TestStopping:
     def test_divergence_keeps_the_best(self) -> None:
         image, labels = disc()
         with pytest.warns(UserWarning, match="diverged"):
-            result = fit(image, labels, 12, recipe=quick(loss="l2", learning_rate_factor=1e33))
+            result = fit(image, labels, 12, recipe=quick(objective="l2", learning_rate_factor=1e33))
         assert result.stop_reason == "diverged"
         assert torch.isfinite(result.scene.field.colors).all()
 
@@ -287,7 +298,12 @@ class TestErrors:
         [
             ({"speed": 5}, "^unknown setting 'speed': there are guidance, .*, target_psnr$"),
             ({"iterations": 0}, "iterations must be greater than or equal to 1; got 0"),
-            ({"loss": "l3"}, "loss must be 'l1', 'l2' or .*; got 'l3'"),
+            ({"objective": "l3"}, "^objective must be one of l2, l1, ms-ssim, l1\\+ssim; got 'l3'$"),
+            ({"objective": "psnr"}, "^objective must be one of l2, .*; got 'psnr', which is now 'l2'$"),
+            ({"objective": "auto"}, "^objective must be .*; got 'auto', which is now the default: leave it out$"),
+            ({"objective": abs}, "^objective must be .*; got a function, which only kcgs.fit takes$"),
+            ({"loss": "l1"}, "^unknown setting 'loss': objective has its values$"),
+            ({"densify": object()}, "^densify must be 'matching-pursuit' or 'largest-error'; got "),
             ({"max_seconds": math.inf}, "max_seconds must be a finite number"),
             ({"backend": "gpu"}, "^backend must be one of auto, [^;]*; got 'gpu'$"),
         ],

@@ -356,7 +356,7 @@ class TestPhoto:
         if not folder.is_dir():
             pytest.skip(f"no BSDS photo in {folder}")
         image, labels = load_image(folder / "image.jpg"), load_labels(folder / "mask.png")
-        field = fit(image, labels, 200, recipe="paper", iterations=60, loss="l2", warmup=False).scene.field
+        field = fit(image, labels, 200, recipe="paper", iterations=60, objective="l2", warmup=False).scene.field
         regions = RegionMap.from_labels(labels, 0.7)
         refined = refine_contours(Scene(field, regions), image)
         assert contour_energy(Scene(field, refined), image) < 0.99 * contour_energy(Scene(field, regions), image)

@@ -15,20 +15,23 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from kcgs import FitConfig, fit
-from kcgs.fitting import FitResult, captured, divergence, report, state
-from kcgs.fitting.events import Densify, EndDrafts, contours, log
+from kcgs.fitting import FitResult, fit_problem
+from kcgs.fitting.events import contours
+from kcgs.fitting.measurement import measure_errors
 from kcgs.fitting.problem import make_problem
-from kcgs.fitting.readback import Readback
 from kcgs.fitting.state import FitState
+from kcgs.fitting.steppers import CudaStepper, EagerStepper
+from kcgs.fitting.steppers.graph import StepGraph
+from kcgs.fitting.steppers.readback import Readback
 from kcgs.functional import PairSoftness, contour_fit
 from kcgs.kernels.cuda.capacity import reports
 from kcgs.optim import gaussian_adam
-from kcgs.optim.descent import FieldDescent
-from kcgs.optim.gaussians import Renderer
+from kcgs.optim.gaussians import Gaussians, Renderer
 
 from .absent_device import AbsentDevice, DeviceTensor
 
 ITERATIONS = 240
+Stepping = Callable[[FitState], Any]
 
 
 def image() -> Tensor:
@@ -36,10 +39,10 @@ def image() -> Tensor:
     return torch.stack([(0.3 * x).sin(), (0.2 * y).cos(), (0.1 * x * y).sin()]).mul(0.4).add(0.5)
 
 
-def run(count: int = 60, **settings: Any) -> FitResult:
-    on_step = settings.pop("on_step", None)
-    recipe = FitConfig(**{"iterations": ITERATIONS, **settings})
-    return fit(image(), None, count, recipe=recipe, on_step=on_step)
+def run(stepper_of: Stepping = CudaStepper, on_step: Any = None, **settings: Any) -> FitResult:
+    """Fit 60 Gaussians with a stepper."""
+    config = FitConfig(**{"iterations": ITERATIONS, **settings})
+    return fit_problem(make_problem(image(), None, 60, config, 0), on_step, stepper_of=stepper_of)
 
 
 def same(a: FitResult, b: FitResult) -> bool:
@@ -49,10 +52,8 @@ def same(a: FitResult, b: FitResult) -> bool:
 
 
 @pytest.fixture
-def ahead(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
-    """Take the form of a device, on the CPU."""
-    monkeypatch.setattr(FitState, "runs_ahead", True)
-    monkeypatch.setattr(log, "_errors_on_cpu", log._errors_on_device)
+def adam_of_a_device(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    """Take GaussianAdam's form for devices: it leaves out gradients of NaN."""
     monkeypatch.setattr(gaussian_adam, "_raises", lambda parameter: False)
     monkeypatch.setattr(gaussian_adam, "_is_compiled", lambda *tensors: False)
     return monkeypatch
@@ -77,71 +78,97 @@ class IdleDevice(Readback):
 
 
 def test_the_errors_of_a_render_are_those_of_the_cpu() -> None:
-    labels = (torch.arange(40) > 17).long().expand(32, 40)
-    for loss in ("l1", "l2"):
-        problem = make_problem(image(), labels, 10, FitConfig(loss=loss), 0)
-        render = image() + 0.4 * torch.randn(3, 32, 40, generator=torch.Generator().manual_seed(0))
-        expected = log._errors_on_cpu(problem, render)
-        torch.testing.assert_close(log._errors_on_device(problem, render), expected, check_dtype=False)
+    """The host waits for none of them, once it knows the pixels near contours."""
+    labels, device = (torch.arange(40) > 17).long().expand(32, 40), AbsentDevice()
+    render = image() + 0.4 * torch.randn(3, 32, 40, generator=torch.Generator().manual_seed(0))
+    for objective in ("l1", "l2", "l1+ssim"):
+        config = FitConfig(objective=objective)
+        expected = measure_errors(make_problem(image(), labels, 10, config, 0), render)
+        with device.use():
+            problem = make_problem(DeviceTensor(image()), labels, 10, config, 0)
+            first, before = measure_errors(problem, DeviceTensor(render)), (device.num_operations, device.num_waits)
+            errors = measure_errors(problem, DeviceTensor(render))
+        assert device.num_waits == before[1] and (objective == "l1+ssim" or device.num_operations < before[0] + 20)
+        assert torch.equal(errors.content, first.content)
+        torch.testing.assert_close(errors.content, expected, check_dtype=False)
 
 
-def test_a_late_log_is_the_log(ahead: pytest.MonkeyPatch) -> None:
+def test_steps_that_are_not_waited_for_are_those_that_are() -> None:
+    assert same(run(EagerStepper), run(CudaStepper))
+
+
+def test_a_late_history_is_the_history() -> None:
     """What has not arrived changes nothing but what a callback sees, and that by fewer than 20 iterations."""
     at_once, num_late = run(), 0
-    ahead.setattr(log, "Readback", IdleDevice)
-    ahead.setattr(divergence, "Readback", IdleDevice)
-    logged = [entry.iteration for entry in at_once.history]
+    measured = [entry.iteration for entry in at_once.history]
 
     def on_step(iteration: int, entry: Any) -> None:
         nonlocal num_late
-        num_late += entry.iteration < max(i for i in logged if i < iteration)
-        assert entry.iteration >= max(i for i in logged if i <= max(0, iteration - 21))
+        num_late += entry.iteration < max(i for i in measured if i < iteration)
+        assert entry.iteration >= max(i for i in measured if i <= max(0, iteration - 21))
 
-    assert same(at_once, run(on_step=on_step)) and num_late > 50
+    assert same(at_once, run(lambda state: CudaStepper(state, IdleDevice), on_step)) and num_late > 50
 
 
-def test_nothing_moves_where_a_step_had_no_room(ahead: pytest.MonkeyPatch) -> None:
+def test_nothing_moves_where_a_step_had_no_room(adam_of_a_device: pytest.MonkeyPatch) -> None:
     """Its gradients and its render are NaN; the history lacks it, and the next steps get more room."""
-    gradients, render, calls, settled = Renderer.squared_error_gradients, FitState.render, [], []
+    gradients, render, calls, waits = Renderer.squared_error_gradients, Renderer.render, [], []
 
-    def missed(function: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*arguments: Any, **settings: Any) -> Any:
-            calls.append(1)
-            values = function(*arguments, **settings)
-            if reports() or len(calls) % 3:  # it waits, or there is room
-                return values
-            return values * math.nan if isinstance(values, Tensor) else values.map(lambda value: value * math.nan)
+    def has_room() -> bool:
+        waits.append(reports())
+        return reports() or len(waits) % 3 > 0
 
-        return call
+    def missed_gradients(renderer: Renderer, gaussians: Gaussians, target: Tensor) -> Gaussians:
+        calls.append(1)
+        values, factor = gradients(renderer, gaussians, target), 1.0 if has_room() else math.nan
+        return values.map(lambda value: value * factor)
 
-    ahead.setattr(state, "settle", lambda device, size: settled.append(size))
-    whole, num_events = run(), len(settled)
-    ahead.setattr(Renderer, "squared_error_gradients", missed(gradients))
-    ahead.setattr(FitState, "render", missed(render))
+    def missed_render(renderer: Renderer, gaussians: Gaussians) -> Tensor:
+        return render(renderer, gaussians) * (1.0 if has_room() else math.nan)
+
+    whole = run()
+    adam_of_a_device.setattr(Renderer, "squared_error_gradients", missed_gradients)
+    adam_of_a_device.setattr(Renderer, "render", missed_render)
     result = run()
-    num_misses = len(settled) - 2 * num_events
-    assert len(calls) > ITERATIONS and 3 < num_misses < ITERATIONS / 20 and set(settled) == {(32, 40)}
+    assert len(waits) > ITERATIONS and waits.count(False) > ITERATIONS / 3
     assert len(whole.history) / 2 < len(result.history) < len(whole.history)
     assert all(math.isfinite(entry.psnr) for entry in result.history)
     assert all(parameter.isfinite().all() for parameter in result.scene.field.parameters())
     assert max(e.psnr for e in result.history) > max(e.psnr for e in whole.history) - 1.5
 
 
-def test_captured_steps_are_those_that_are_not(ahead: pytest.MonkeyPatch) -> None:
+class RecordedGraph(StepGraph):
+    """A graph that calls its step again."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.num_captures = self.num_replays = 0
+
+    def record(self, move: Callable[[], None], device: torch.device) -> Any:
+        def replay() -> None:
+            self.num_replays += 1
+            move()
+
+        self.num_captures += 1
+        return SimpleNamespace(replay=replay)
+
+
+class ReplayingStepper(CudaStepper):
+    """A stepper that replays steps on the CPU, too."""
+
+    def _can_replay(self) -> bool:
+        return self._runs_ahead()
+
+
+@pytest.mark.usefixtures("adam_of_a_device")  # learning rates in float32
+def test_captured_steps_are_those_that_are_not() -> None:
     """Between events there is one capture, except before the first event that follows the checked iterations."""
-    expected, captures, replays = run(), [], []
-
-    def record(step: Callable[[], None], previous: Any, device: torch.device) -> SimpleNamespace:
-        captures.append(step)
-        return SimpleNamespace(replay=lambda: replays.append(step()))
-
-    ahead.setattr(FitState, "replays", FitState.is_settled)
-    ahead.setattr(captured, "_record", record)
-    assert same(expected, run())
-    assert 3 < len(captures) < len(replays) / 4 and len(replays) > ITERATIONS / 3
+    graph = RecordedGraph()
+    assert same(run(), run(lambda state: ReplayingStepper(state, graph=graph)))
+    assert 3 < graph.num_captures < graph.num_replays / 4 and graph.num_replays > ITERATIONS / 3
 
 
-def test_divergence_ends_the_fit_within_20_iterations(ahead: pytest.MonkeyPatch) -> None:
+def test_divergence_ends_the_fit_within_20_iterations(adam_of_a_device: pytest.MonkeyPatch) -> None:
     with pytest.warns(UserWarning, match="the fit diverged at iteration [12]0: the best so far is kept"):
         result = run(learning_rate_factor=1e33)
     assert result.stop_reason == "diverged"
@@ -193,32 +220,41 @@ class Counter(TorchDispatchMode):
 READS = ["item", "tolist", "numpy", "cpu", "__bool__", "__float__", "__int__", "__index__", "nonzero"]
 
 
-def test_a_step_reads_no_value_and_takes_few_operations(ahead: pytest.MonkeyPatch) -> None:
-    """Besides the kernel's: see its own test. A render that is checked belongs to a log or to an event."""
-    counter, steps, checked = Counter(), [], set()
-    for owner, name in ((Renderer, "squared_error_gradients"), (gaussian_adam, "_launch")):
-        ahead.setattr(owner, name, counter.paused(getattr(owner, name), name))
-    ahead.setattr(gaussian_adam, "takes_triton", lambda *tensors: True)
-    ahead.setattr(gaussian_adam, "_launch", lambda *arguments: counter.operations.append("_launch"))
-    for owner, name in ((Readback, "numbers"), (Densify, "act"), (EndDrafts, "act"), (torch.autograd, "grad")):
-        ahead.setattr(owner, name, counter.paused(getattr(owner, name)))
-    render = counter.paused(FitState.render)
-    ahead.setattr(FitState, "render", lambda state: checked.add(state.iteration) or render(state))
+class CountedStepper(CudaStepper):
+    """Counts the operations of steps that wait for nothing."""
+
+    def __init__(self, state: FitState, counter: Counter) -> None:
+        super().__init__(state)
+        self.counter, self.counts = counter, list[int]()
+
+    def step(self, rate: float) -> None:
+        self.counter.operations, self.counter.reads = [], []
+        # a render that was measured is differentiated by itself
+        is_counted = self._runs_ahead() and self._rendered is None
+        with self.counter:
+            super().step(rate)
+        if is_counted:
+            assert not self.counter.reads and "aten._local_scalar_dense.default" not in self.counter.operations
+            self.counts.append(len(self.counter.operations))
+
+
+def test_a_step_reads_no_value_and_takes_few_operations(adam_of_a_device: pytest.MonkeyPatch) -> None:
+    """Besides the kernel's: see its own test."""
+    counter, steppers = Counter(), []
+    for owner, name in ((Renderer, "squared_error_gradients"), (Renderer, "render"), (torch.autograd, "grad")):
+        adam_of_a_device.setattr(owner, name, counter.paused(getattr(owner, name), name))
+    adam_of_a_device.setattr(gaussian_adam, "takes_triton", lambda *tensors: True)
+    adam_of_a_device.setattr(gaussian_adam, "_launch", lambda *arguments: counter.operations.append("_launch"))
     for name in READS:
-        ahead.setattr(Tensor, name, counter.reading(getattr(Tensor, name)))
+        adam_of_a_device.setattr(Tensor, name, counter.reading(getattr(Tensor, name)))
 
-    def on_step(iteration: int, entry: Any) -> None:
-        steps.append((iteration - 1, [*counter.operations], [*counter.reads]))
-        counter.operations.clear()
-        counter.reads.clear()
+    def stepper_of(state: FitState) -> CountedStepper:
+        steppers.append(CountedStepper(state, counter))
+        return steppers[-1]
 
-    with counter:
-        run(on_step=on_step, iterations=300)
-    for _, operations, reads in steps[1:]:  # the first has the band, once
-        assert not reads and "aten._local_scalar_dense.default" not in operations, (reads, operations)
-    counts = [len(operations) for iteration, operations, _ in steps if iteration not in checked]
-    assert len(counts) > 150 and min(counts) == 2 and max(counts) <= 6
-    assert max(len(operations) for _, operations, _ in steps[1:]) <= 25
+    run(stepper_of, iterations=300)
+    counts = steppers[0].counts
+    assert len(counts) > 150 and min(counts) == max(counts) == 2
 
 
 def test_contours_move_on_a_device_with_few_waits_and_sums_of_one_order(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -248,39 +284,46 @@ def test_contours_move_on_a_device_with_few_waits_and_sums_of_one_order(monkeypa
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="it takes a GPU")
 @pytest.mark.parametrize("has_regions", [False, True])
-def test_no_step_waits_for_a_gpu(monkeypatch: pytest.MonkeyPatch, has_regions: bool) -> None:
+def test_no_step_waits_for_a_gpu(has_regions: bool) -> None:
     """By torch's check of synchronisations, in all that a step does without an event."""
-    calls = []
+    num_checked = 0
 
-    def without_waits(owner: Any, name: str, is_always: bool) -> None:
-        function = getattr(owner, name)
-
-        @functools.wraps(function)
-        def call(*arguments: Any, **settings: Any) -> Any:
-            calls.append(name)
-            # the first step compiles, and finds the pixels near contours
-            is_checked = calls.count("step") > 1 and (is_always or not reports())
+    class CheckedStepper(CudaStepper):
+        def check(self, name: str, *arguments: Any) -> Any:
+            nonlocal num_checked
+            # the first steps compile, and find the pixels near contours
+            is_checked = self._runs_ahead() and self._state.iteration > ITERATIONS // 2
+            num_checked += is_checked
             torch.cuda.set_sync_debug_mode("error" if is_checked else "default")
             try:
-                return function(*arguments, **settings)
+                return getattr(super(), name)(*arguments)
             finally:
                 torch.cuda.set_sync_debug_mode("default")
 
-        monkeypatch.setattr(owner, name, call)
+        def step(self, rate: float) -> None:
+            self.check("step", rate)
 
-    without_waits(divergence.StopAtDivergence, "act", True)
-    without_waits(report, "collect_measurements", True)
-    without_waits(gaussian_adam.GaussianAdam, "step", True)
-    without_waits(log, "measure", False)
-    without_waits(captured.CapturedStep, "__call__", True)
-    without_waits(FitState, "render", False)
-    without_waits(FieldDescent, "move", False)
+        def measure(self, seconds: float) -> None:
+            self.check("measure", seconds)
+
+        def has_diverged(self) -> bool:
+            return self.check("has_diverged")
+
+    class NeverReplaying(CudaStepper):
+        def _can_replay(self) -> bool:
+            return False
+
     labels = (torch.arange(40) > 17).long().expand(32, 40) if has_regions else None
-    results = [fit(image().cuda(), labels, 60, recipe=FitConfig(iterations=ITERATIONS)) for _ in range(2)]
-    assert calls.count("__call__") > ITERATIONS and calls.count("step") >= ITERATIONS / 2
-    assert all(torch.equal(*pair) for pair in zip(*(r.scene.field.parameters() for r in results), strict=True))
-    monkeypatch.setattr(FitState, "replays", False)
-    eager = fit(image().cuda(), labels, 60, recipe=FitConfig(iterations=ITERATIONS))
-    assert all(torch.equal(*pair) for pair in zip(results[0].scene.parameters(), eager.scene.parameters(), strict=True))
-    on_cpu = fit(image(), labels, 60, recipe=FitConfig(iterations=ITERATIONS))
+    config = FitConfig(iterations=ITERATIONS)
+
+    def run_on(device: str, stepper_of: Stepping) -> FitResult:
+        return fit_problem(make_problem(image().to(device), labels, 60, config, 0), stepper_of=stepper_of)
+
+    results = [run_on("cuda", stepper_of) for stepper_of in (CheckedStepper, CheckedStepper, NeverReplaying)]
+    assert num_checked > ITERATIONS / 2
+    for result in results[1:]:
+        assert all(
+            torch.equal(*pair) for pair in zip(results[0].scene.parameters(), result.scene.parameters(), strict=True)
+        )
+    on_cpu = run_on("cpu", EagerStepper)
     assert max(e.psnr for e in results[0].history) > max(e.psnr for e in on_cpu.history) - 0.5

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from kcgs import RegionMap, RegionSplatRenderer, fit
 from kcgs.fitting import initial_field, lowest_impact, propose_gaussians
-from kcgs.fitting.config import FitConfig
-from kcgs.fitting.events.densify import Densify
+from kcgs.fitting.problem import make_problem
 from kcgs.fitting.state import FitState
 from kcgs.functional import psnr
 from kcgs.optim import GaussianAdam
@@ -38,10 +37,19 @@ def squared(render: Tensor) -> Tensor:
     return (render - image()).square().mean()
 
 
+class OldEvent:
+    """An event of version 0.3, which would act at every iteration."""
+
+    def due(self, state: FitState) -> float:
+        return 0.5
+
+    def act(self, state: FitState) -> None: ...
+
+
 class TestLoss:
     @pytest.mark.parametrize("regions", [None, LABELS])
     def test_l1_is_the_loss_of_that_name(self, regions: Tensor | None) -> None:
-        own, named = (fit(image(), regions, 60, iterations=150, **s) for s in ({"objective": l1}, {"loss": "l1"}))
+        own, named = (fit(image(), regions, 60, iterations=150, **s) for s in ({"objective": l1}, {"objective": "l1"}))
         assert max(e.psnr for e in own.history) > max(e.psnr for e in named.history) - 0.3
         assert own.history[-1].loss == pytest.approx(named.history[-1].loss, rel=0.1)
         best = min(entry.loss for entry in own.history[-20:])
@@ -74,31 +82,48 @@ class TestLoss:
             ({"image": None, "size": (32, 40), "target_psnr": 20.0}, "target_psnr must be None without an image"),
             ({"size": (32, 40)}, "size must be None with an image"),
             (
-                {"image": None, "objective": "psnr", "size": (32, 40)},
+                {"image": None, "objective": "l2", "size": (32, 40)},
                 "image must be given, unless objective is a loss of your own; got None",
             ),
-            ({"objective": "l1"}, "objective must be 'auto', 'psnr' or 'ms-ssim', or a function of your own; got 'l1'"),
+            ({"objective": 3}, "objective must be a name or a function; got 3"),
+            ({"densify": OldEvent()}, "densify must be an event without `due`, whose `act` knows when it acts; got "),
+            ({"densify": 3}, "densify must be a name, or an event with `act` and `end`; got 3"),
         ],
     )
     def test_bad_arguments(self, change: dict[str, Any], words: str) -> None:
         with pytest.raises(ValueError, match=words):
             fit(**{"image": image(), "num_gaussians": 5, "objective": l1, "iterations": 3, **change})
 
-    def test_files_and_videos_take_names(self) -> None:
-        with pytest.raises(ValueError, match="objective must be 'psnr' or 'ms-ssim' with target_bytes"):
-            fit_bytes(image(), None, 300, objective=l1)
-        with pytest.raises(ValueError, match="objective must be a name: frames differ"):
-            fit_video([image()], objective=l1)
+    def test_the_loss_of_the_history_is_the_value_of_the_objective(self) -> None:
+        for objective in ("l2", "l1", "ms-ssim", "l1+ssim"):
+            result = fit(image(), None, 40, iterations=30, objective=objective, prune=0.0)
+            problem = make_problem(image(), None, 40, result.config, 0)
+            value = float(problem.objective.value(result.scene().detach()))
+            assert min(entry.loss for entry in result.history) == pytest.approx(value, rel=1e-4)
+
+    @pytest.mark.parametrize(
+        ("objective", "words"),
+        [
+            (l1, "objective must be one of .*; got a function, which only kcgs.fit takes"),
+            ("l1", "objective must be (ms-ssim or l2 for a file|l2 or ms-ssim for a video); got 'l1'"),
+        ],
+    )
+    def test_files_and_videos_lower_what_they_can(self, objective: Any, words: str) -> None:
+        with pytest.raises(ValueError, match=words):
+            fit_bytes(image(), None, 300, objective=objective)
+        with pytest.raises(ValueError, match=words):
+            fit_video([image()], objective=objective)
 
 
 @dataclass(frozen=True)
 class AddAll:
     """Adds all Gaussians at the middle of a fit."""
 
-    def due(self, state: FitState) -> float:
-        return math.inf if state.num_additions else 0.5
+    end: float = 0.5
 
     def act(self, state: FitState) -> None:
+        if state.num_additions or state.progress < self.end:
+            return
         state.num_additions += 1
         error = state.problem.image - state.render().detach()
         state.optimizer.append(state.field, propose_gaussians(error, 30, state.regions))
@@ -111,14 +136,6 @@ def test_an_event_and_an_optimizer_of_ones_own(tmp_path: Path) -> None:
     assert counts[28] == 2 and counts[-1] == 32 and result.history[-1].psnr > result.history[0].psnr + 5
     with pytest.raises(ValueError, match="checkpoint must be None with densify of your own"):
         fit(image(), LABELS, 60, checkpoint=tmp_path / "state", **settings)
-
-
-def test_an_event_that_is_a_dataclass() -> None:
-    """Settings that hold one may be given as a recipe, and changed."""
-    event = Densify(steps=2)
-    config = FitConfig.from_recipe(FitConfig(densify=event), iterations=40)
-    assert config.densify is event and "Densify(" in repr(config)
-    assert fit(image(), LABELS, 20, recipe=config).scene.num_gaussians == 20
 
 
 class TestLoop:

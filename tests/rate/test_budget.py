@@ -47,7 +47,7 @@ class TestFitBytes:
         image, labels = photo
         psnrs = [10.0]
         for target in (500, 1500):
-            file = fit_bytes(image, labels, target, iterations=150, objective="psnr")
+            file = fit_bytes(image, labels, target, iterations=150, objective="l2")
             assert 0.93 * target < len(file.data) <= target
             assert torch.equal(decode(file.data).scene.field.means, file.scene.field.means)
             assert file.result.stop_reason == "iterations"
@@ -67,7 +67,7 @@ class TestFitBytes:
     def test_objective(self, photo: Photo) -> None:
         """Files raise MS-SSIM unless they are told otherwise."""
         error = MsSsim(photo[0])
-        files = [fit_bytes(photo[0], None, 600, iterations=100, objective=name) for name in ("auto", "psnr")]
+        files = [fit_bytes(photo[0], None, 600, iterations=100, objective=name) for name in (None, "l2")]
         values = [error.value(file.scene.render()) for file in files]
         assert values[0] < 0.95 * values[1]
 
@@ -121,7 +121,7 @@ class TestFitBytes:
             return SimpleNamespace(scene=SimpleNamespace(render=lambda: trials[problem.regions is None]))
 
         monkeypatch.setattr(budget, "_fit_share", trial)
-        config = FitConfig(objective="psnr")
+        config = FitConfig(objective="l2")
         choice = budget._choose_regions(make_problem(image, labels, 1, config, 0), 900)
         assert (choice.regions is not None) == is_used
 
@@ -139,6 +139,6 @@ class TestFitBytes:
 
 
 def test_gaussian_budget() -> None:
-    counts = [BUDGETS["psnr"].num_gaussians(size, 10_000) for size in (1, 100, 1000, 8000, 50_000)]
+    counts = [BUDGETS["l2"].num_gaussians(size, 10_000) for size in (1, 100, 1000, 8000, 50_000)]
     assert counts == sorted(counts) and counts[0] == 1 and 2200 < counts[3] < 2700
     assert BUDGETS["ms-ssim"].num_gaussians(8000, 10_000) < 0.95 * counts[3]

@@ -23,7 +23,7 @@ class TestCompress:
     @pytest.mark.parametrize("target", [700, 1300])
     def test_bytes(self, photo: Photo, scene: Scene, target: int) -> None:
         """The file fills its bytes, with less error than one that does not know the image."""
-        compressed = compress(scene, photo[0], target_bytes=target, iterations=150, objective="psnr")
+        compressed = compress(scene, photo[0], target_bytes=target, iterations=150, objective="l2")
         assert 0.99 * target <= len(compressed.data) <= target
         plain = decode(encode(scene, target_bytes=target)).scene
         assert psnr(plain, photo[0]) + 0.1 < psnr(compressed.scene, photo[0])
@@ -32,19 +32,19 @@ class TestCompress:
     def test_quality(self, photo: Photo, scene: Scene) -> None:
         """A file of the scene's quality is nearly as good as the scene, and a PSNR that the scene has is reached."""
         scene_psnr = psnr(scene, photo[0])
-        quality = compress(scene, photo[0], iterations=200, quality=quality_for(scene_psnr), objective="psnr")
+        quality = compress(scene, photo[0], iterations=200, quality=quality_for(scene_psnr), objective="l2")
         assert scene_psnr - 0.3 < psnr(quality.scene, photo[0])
         exact = compress(scene, photo[0], iterations=20, target_psnr=scene_psnr - 0.1)
         assert scene_psnr - 0.1 <= psnr(exact.scene, photo[0])
 
     def test_psnr_beyond_the_scene(self, photo: Photo, scene: Scene) -> None:
-        coarse = compress(scene, photo[0], iterations=2, quality=quality_for(psnr(scene, photo[0])), objective="psnr")
+        coarse = compress(scene, photo[0], iterations=2, quality=quality_for(psnr(scene, photo[0])), objective="l2")
         assert compress(scene, photo[0], iterations=2, target_psnr=99.0).data == coarse.data
 
     def test_objective(self, photo: Photo, scene: Scene) -> None:
         images = [
             compress(scene, photo[0], quality=36, iterations=100, objective=name).scene.render()
-            for name in ("psnr", "ms-ssim")
+            for name in ("l2", "ms-ssim")
         ]
         error = MsSsim(photo[0])
         assert error.value(images[1]) < 0.95 * error.value(images[0])
@@ -78,7 +78,12 @@ class TestCompress:
         ("changes", "match"),
         [
             ({"image": torch.zeros(3, 50, 160)}, "image must have shape"),
-            ({"objective": "l1"}, "objective must be one of auto, psnr, ms-ssim; got 'l1'"),
+            ({"objective": "l1"}, "objective must be ms-ssim or l2 for a file; got 'l1'"),
+            (
+                {"objective": "l1", "target_psnr": 30.0},
+                "objective must be l2 or ms-ssim for a file of a PSNR; got 'l1'",
+            ),
+            ({"objective": "psnr"}, "objective must be one of .*; got 'psnr', which is now 'l2'"),
             ({"iterations": 0}, "iterations must be at least 1; got 0"),
             ({"quality": 40, "target_bytes": 900}, "quality must be None with target_bytes; got 40"),
             ({"quality": 40, "target_psnr": 30.0}, "target_psnr must be None with quality or target_bytes; got 30"),
@@ -121,6 +126,6 @@ class TestSoftBits:
         psnrs = []
         for price in (0.0, 0.9):
             monkeypatch.setattr("kcgs.rate.descent._BIT_PRICE", price)
-            file = compress(scene, photo[0], target_bytes=1100, iterations=200, objective="psnr")
+            file = compress(scene, photo[0], target_bytes=1100, iterations=200, objective="l2")
             psnrs.append(psnr(file.scene, photo[0]))
         assert psnrs[0] + 0.05 < psnrs[1]

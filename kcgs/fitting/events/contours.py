@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -36,21 +35,21 @@ class AdaptContours:
         is_turn = state.num_additions % self.additions_per_softness == self.additions_per_move
         if regions is not None and problem.chooses_softness and is_turn:
             labels = regions.labels.cpu()
-            chosen = RegionMap.from_labels(labels, choose_softness(problem.image, labels))
-            state.regions = chosen.to(problem.image.device)
+            chosen = RegionMap.from_labels(labels, choose_softness(problem.canvas, labels))
+            state.regions = chosen.to(problem.device)
 
 
 def _move_contours(state: FitState, max_rise: float) -> None:
     """Move the contours where that raises the squared error about them by no more than a factor."""
-    problem, gaussians, renderer = state.problem, state.gaussians, state.renderer
-    if state.regions is None or state.anchor is None or not problem.has_image:
+    gaussians, renderer, image = state.gaussians, state.renderer, state.problem.image
+    if state.regions is None or state.anchor is None or image is None:
         return
 
     def squared_error(regions: RegionMap) -> Tensor:
-        return renderer._replace(regions=regions).squared_error(gaussians, problem.image)
+        return renderer._replace(regions=regions).squared_error(gaussians, image)
 
-    anchor = state.anchor.labels
-    state.regions = move_contours(state.scene, problem.image, anchor, problem.config, squared_error, max_rise)
+    config, anchor = state.problem.config, state.anchor.labels
+    state.regions = move_contours(state.scene, image, anchor, config, squared_error, max_rise)
 
 
 @dataclass(frozen=True)
@@ -62,13 +61,11 @@ class SettleContours:
     num_moves: int = 4
     """How often contours move, evenly over the rest of the fit."""
 
-    def due(self, state: FitState) -> float:
-        """Return the time of the next move."""
-        move = state.num_late_moves + 1
-        return self.after + (1 - self.after) * move / (self.num_moves + 1) if move <= self.num_moves else math.inf
-
     @torch.no_grad()
     def act(self, state: FitState) -> None:
-        """Move the contours."""
-        state.num_late_moves += 1
-        _move_contours(state, max_rise=1.0)
+        """Move the contours, if it is time to."""
+        move = state.num_late_moves + 1
+        time = self.after + (1 - self.after) * move / (self.num_moves + 1)
+        if move <= self.num_moves and state.progress >= time:
+            state.num_late_moves = move
+            _move_contours(state, max_rise=1.0)

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
 
-from kcgs.fitting.pursuit import propose_for
+from kcgs.fitting.pursuit import add_gaussians
 from kcgs.fitting.removal import remove_gaussians
 from kcgs.fitting.state import FitState
-from kcgs.nn import GaussianField
 
 from .contours import AdaptContours
-
-# of progress, beyond rounding errors
-_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -56,32 +51,17 @@ class Densify:
             return first + round((most - first) * (1 + int(share * (self.steps - 1))) / self.steps)
         if progress >= self.settled:
             return final
-        phase = (progress - self.end) / (self.settled - self.end) * self._num_cycles(state) % 1.0
+        phase = (progress - self.end) / (self.settled - self.end) * (state.num_cycles or self._num_cycles(state)) % 1.0
         return most - round((most - final) * int(phase * (self.removals + 1)) / self.removals)
-
-    def due(self, state: FitState) -> float:
-        """Return the progress at which the schedule asks for another number of Gaussians, or somewhat less."""
-        return state.progress if self.target(state) != state.num_requested else self._next_change(state)
-
-    def _next_change(self, state: FitState) -> float:
-        progress = state.progress
-        if progress < self.begin:
-            return self.begin
-        if progress < self.end:
-            count, first, last = max(1, self.steps - 1), self.begin, self.end
-        elif progress < self.settled:
-            count, first, last = self._num_cycles(state) * (self.removals + 1), self.end, self.settled
-        else:
-            return math.inf
-        part = int((progress - first) / (last - first) * count - _TOLERANCE)
-        return min(last, first + (last - first) * (part + 1) / count - _TOLERANCE)
 
     def _num_cycles(self, state: FitState) -> int:
         return max(1, round((self.settled - self.end) * state.expected_iterations / self.cycle))
 
     @torch.no_grad()
     def act(self, state: FitState) -> None:
-        """Add or remove Gaussians, once a state was measured."""
+        """Add or remove Gaussians where the schedule asks for another number, once a state was measured."""
+        if state.num_cycles == 0 and state.progress >= self.end:  # from here on a clock changes it no more
+            state.num_cycles = self._num_cycles(state)
         target = self.target(state)
         if not state.history or target == state.num_requested:
             return
@@ -96,9 +76,4 @@ class Densify:
 
     def add(self, state: FitState, count: int) -> None:
         """Add so many Gaussians, if any."""
-        if count > 0:
-            state.optimizer.append(state.field, self.propose(state, count))
-
-    def propose(self, state: FitState, count: int) -> GaussianField:
-        """Return the Gaussians to add."""
-        return propose_for(state.objective, state.render().detach(), state.renderer, count)
+        add_gaussians(state, count)

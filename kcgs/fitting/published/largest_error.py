@@ -24,8 +24,10 @@ class DensifyAtLargestError(Densify):
     end: float = 0.2
     surplus: float = 0.0
 
-    def propose(self, state: FitState, count: int) -> GaussianField:
-        """Return round Gaussians of half the spacing, of the colour that their pixel lacks."""
+    def add(self, state: FitState, count: int) -> None:
+        """Add round Gaussians of half the spacing, of the colour that their pixel lacks."""
+        if count <= 0:
+            return
         problem, (_, width) = state.problem, state.problem.size
         residual = state.objective.residual(state.render().detach()).error
         error = residual.square().mean(0).flatten().double().cpu().numpy() + 1e-12
@@ -35,4 +37,5 @@ class DensifyAtLargestError(Densify):
         sigma = means.new_full((count,), initial_sigma(problem.size, problem.num_gaussians))
         ids = None if state.regions is None else lookup_regions(means, state.regions.labels)
         cholesky = torch.stack([sigma, torch.zeros_like(sigma), sigma], -1)
-        return GaussianField(means, cholesky, residual.flatten(1)[:, pixels].T, ids, size=problem.size)
+        added = GaussianField(means, cholesky, residual.flatten(1)[:, pixels].T, ids, size=problem.size)
+        state.optimizer.append(state.field, added)

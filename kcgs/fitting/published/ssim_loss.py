@@ -13,7 +13,9 @@ _SSIM_WEIGHT = 0.1
 
 
 class AbsoluteAndSsim(AbsoluteError):
-    """L1 + 0.1 (1 - SSIM); its value, which a history shows, is L1 alone."""
+    """L1 + 0.1 (1 - SSIM)."""
+
+    power = None
 
     def slope(self, render: Tensor) -> Tensor:
         """Return the gradient, times the number of values."""
@@ -21,3 +23,7 @@ class AbsoluteAndSsim(AbsoluteError):
         with torch.enable_grad():
             (slope,) = torch.autograd.grad(ssim(leaf, self.image), leaf)
         return super().slope(render).sub_(_SSIM_WEIGHT * leaf.numel() * slope)
+
+    def value(self, render: Tensor) -> Tensor:
+        """Return the weighted sum."""
+        return super().value(render) + _SSIM_WEIGHT * (1 - ssim(render, self.image))

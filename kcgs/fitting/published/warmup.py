@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -20,23 +19,13 @@ class Warmup:
     until: float = 0.5
     """Share of the iterations after which the ids are frozen."""
 
-    def due(self, state: FitState) -> float:
-        """Return the progress at the next refresh, if no clock runs ahead of the iterations."""
-        is_over = state.regions is None or state.iteration > self._last(state)
-        return math.inf if is_over else state.next_multiple(self._interval(state))
-
-    def _last(self, state: FitState) -> float:
-        return self.until * state.problem.config.num_iterations
-
-    def _interval(self, state: FitState) -> int:
-        return max(1, round(self.every * state.problem.config.num_iterations))
-
     def act(self, state: FitState) -> None:
         """Read the ids, but leave no region without its last Gaussian: nothing else would feel the error there."""
-        if state.iteration % self._interval(state) or not 0 < state.iteration <= self._last(state):
+        field, regions, iterations = state.field, state.regions, state.problem.config.num_iterations
+        is_turn = state.iteration % max(1, round(self.every * iterations)) == 0
+        if regions is None or not is_turn or not 0 < state.iteration <= self.until * iterations:
             return
-        field, regions = state.field, state.regions
-        assert regions is not None and field.region_ids is not None
+        assert field.region_ids is not None
         ids = lookup_regions(field.means, regions.labels)
         occupied = torch.zeros(regions.num_regions, dtype=torch.bool, device=ids.device)
         occupied[regions.index_of(ids)] = True

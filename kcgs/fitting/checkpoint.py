@@ -13,22 +13,21 @@ from typing import Any
 import torch
 
 from kcgs._atomic import check_writable, write_file
-from kcgs.fitting.problem import Problem
-from kcgs.fitting.result import HistoryEntry
-from kcgs.fitting.start import make_state
-from kcgs.fitting.state import FitState
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
-from .log import collect_measurements
+from .problem import Problem
+from .result import HistoryEntry
+from .start import make_state
+from .state import FitState
 
 # a checkpoint is written when the fit has run this many times as long as the last one took to write
 _RUN_PER_WRITE = 100.0
-_VERSION = 8
+_VERSION = 9
 _DIGEST_SIZE = 32  # bytes of the SHA-256 of the content, which begins the file
 # all fields of the state that are numbers
-_NUMBERS = [field.name for field in fields(FitState) if field.type in ("int", "float")]
+_NUMBERS = [field.name for field in fields(FitState) if field.type in ("int", "float", "bool")]
 _NUMBERS.remove("progress")  # the clock may give it anew
 
 
@@ -40,15 +39,16 @@ class Checkpoint:
         self.path, self.problem = Path(path), problem
         self._next_write = 0.0
 
-    def write(self, state: FitState, seconds: float) -> None:
-        """Put the state, and the seconds of the fit so far, in the file's place, unless it was written just now.
+    def is_due(self, state: FitState) -> bool:
+        """True at the last iteration, and where the file has not been written for a while.
 
-        Writing costs about a hundredth of the fit.
+        So writing takes about a hundredth of the fit.
         """
+        return time.perf_counter() >= self._next_write or state.iteration >= self.problem.config.max_iterations
+
+    def write(self, state: FitState, seconds: float) -> None:
+        """Put the state, and the seconds of the fit so far, in the file's place."""
         start = time.perf_counter()
-        if start < self._next_write and state.iteration < self.problem.config.max_iterations:
-            return
-        collect_measurements(state, wait=True)
         buffer = io.BytesIO()
         torch.save({"problem": _fingerprint(self.problem), "seconds": seconds, **_to_plain(state)}, buffer)
         content = buffer.getvalue()
@@ -62,7 +62,7 @@ class Checkpoint:
         digest, content = data[:_DIGEST_SIZE], data[_DIGEST_SIZE:]
         if hashlib.sha256(content).digest() != digest:
             raise ValueError(f"checkpoint {str(self.path)!r} is damaged, or no checkpoint of a fit")
-        plain = torch.load(io.BytesIO(content), self.problem.image.device, weights_only=True)
+        plain = torch.load(io.BytesIO(content), self.problem.device, weights_only=True)
         if plain["problem"] != _fingerprint(self.problem):
             raise ValueError(
                 f"checkpoint {str(self.path)!r} belongs to another fit: image, regions, settings, num_gaussians and "
@@ -74,9 +74,9 @@ class Checkpoint:
 def _fingerprint(problem: Problem) -> str:
     # a fit that goes on may get more time
     settings = problem.config.model_dump_json(exclude={"max_seconds"})
-    numbers = f"{_VERSION} {settings} {problem.num_gaussians} {problem.seed} {tuple(problem.image.shape)}"
+    numbers = f"{_VERSION} {settings} {problem.num_gaussians} {problem.seed} {tuple(problem.canvas.shape)}"
     digest = hashlib.sha256(numbers.encode())
-    digest.update(problem.image.cpu().numpy().tobytes())
+    digest.update(problem.canvas.cpu().numpy().tobytes())
     if problem.regions is not None:
         digest.update(repr(problem.regions.softness).encode())
         digest.update(problem.regions.labels.cpu().numpy().tobytes())

@@ -1,0 +1,38 @@
+"""The names of objectives, and which of them each purpose takes; without torch, for the command line reads them."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+from .errors import InvalidArgument
+
+ObjectiveName = Literal["l2", "l1", "ms-ssim", "l1+ssim"]
+Purpose = Literal["fit", "file", "file of a PSNR", "video"]
+NAMES: tuple[ObjectiveName, ...] = get_args(ObjectiveName)
+# the objectives of each purpose; the first is its default
+PURPOSES: dict[Purpose, tuple[ObjectiveName, ...]] = {
+    "fit": NAMES,
+    "file": ("ms-ssim", "l2"),
+    "file of a PSNR": ("l2", "ms-ssim"),
+    "video": ("l2", "ms-ssim"),
+}
+# names of version 0.3, and what to write now
+_RENAMED = {"psnr": "which is now 'l2'", "auto": "which is now the default: leave it out"}
+
+
+def check_objective(name: object) -> ObjectiveName | None:
+    """Return the name of an objective, or None."""
+    if name is None or name in NAMES:
+        return name
+    received = f"{name!r}, {_RENAMED[name]}" if isinstance(name, str) and name in _RENAMED else repr(name)
+    if not isinstance(name, str):
+        received = "a function, which only kcgs.fit takes" if callable(name) else type(name).__name__
+    raise InvalidArgument("objective", f"one of {', '.join(NAMES)}", received)
+
+
+def objective_for(purpose: Purpose, name: ObjectiveName | None) -> ObjectiveName:
+    """Return the objective of a purpose, None for its default; refuse one that it cannot lower."""
+    names = PURPOSES[purpose]
+    if name is not None and name not in names:
+        raise InvalidArgument("objective", f"{' or '.join(names)} for a {purpose}", repr(name))
+    return name or names[0]

@@ -1,0 +1,133 @@
+"""Steps of a fit on a GPU, which the host does not wait for."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from operator import is_not
+
+import torch
+from torch import Tensor
+
+from kcgs.fitting.measurement import measure_errors, snapshot
+from kcgs.fitting.state import LARGEST, Errors, FitState, Measurement, record
+from kcgs.kernels import settle, without_waiting
+from kcgs.optim import move_field, set_rates
+
+from .graph import StepGraph
+from .readback import Readback
+
+# at the start of a fit, steps that wait, since Gaussians may grow faster than the room for their lists
+_CHECKED_ITERATIONS = 20
+# iterations from one check of divergence to the next: the host is at most twice as many before the device
+_ITERATIONS_PER_CHECK = 10
+
+
+class CudaStepper:
+    """Steps by which the host runs ahead of a GPU; between events they are replayed as a CUDA graph.
+
+    A step that the device has no room for has gradients and a render of NaN: GaussianAdam leaves out the former, the
+    history the latter. The step after an event waits, to learn how much room its lists take, and so do the first steps
+    and the one after the host has learned of missing room.
+
+    Args:
+        state: of a fit by GaussianAdam.
+        read_back: starts the copy of a tensor to the host.
+        graph: replays a step.
+    """
+
+    def __init__(
+        self, state: FitState, read_back: Callable[[Tensor], Readback] = Readback, graph: StepGraph | None = None
+    ) -> None:
+        self._state, self._read_back, self._graph = state, read_back, graph or StepGraph()
+        self._first_iteration = state.iteration
+        self._last_content: list[object] = []
+        self._lacks_room = False
+        self._rendered: Tensor | None = None
+        self._pending: deque[tuple[Measurement, Readback]] = deque()
+        self._magnitudes: Readback | None = None
+
+    def step(self, rate: float) -> None:
+        """See :class:`Stepper`."""
+        state, rendered = self._state, self._rendered
+        self._rendered = None
+        if self._must_wait():
+            settle(state.problem.device, state.problem.size)
+            self._graph.forget()
+        set_rates(state, rate)
+        with self._running_ahead():
+            if self._can_replay():
+                self._graph.step(state)
+            else:
+                move_field(state, rendered)
+        state.iteration += 1
+        self._last_content, self._lacks_room = self._content(), False
+
+    def measure(self, seconds: float) -> None:
+        """See :class:`Stepper`; the first measurement of a fit is waited for."""
+        state = self._state
+        with self._running_ahead():
+            self._rendered = state.render()
+            errors = self._read_back(measure_errors(state.problem, self._rendered))
+        # of the Gaussians as they are now, since only the errors say whether they are the best
+        self._pending.append((snapshot(state, seconds), errors))
+        self.poll(wait=not state.history)
+
+    def poll(self, *, wait: bool = False) -> None:
+        """See :class:`Stepper`."""
+        while self._pending and (wait or self._pending[0][1].has_arrived()):
+            measurement, errors = self._pending.popleft()
+            record(self._state, measurement, Errors(*errors.numbers()))
+        if wait:
+            settle(self._state.problem.device, self._state.problem.size)
+
+    def has_diverged(self) -> bool:
+        """See :class:`Stepper`; up to 20 iterations late.
+
+        Every ten iterations the host waits for the numbers of ten iterations before. There it also learns whether a
+        step had no room.
+        """
+        if self._state.iteration % _ITERATIONS_PER_CHECK:
+            return False
+        field = self._state.field
+        tables = [field.means, field.cholesky, field.colors]
+        gradients = [table.grad for table in tables if table.grad is not None]
+        previous, self._magnitudes = self._magnitudes, self._read_back(_magnitudes([*tables, *gradients]))
+        if previous is None:
+            return False
+        numbers, columns = previous.numbers(), sum(table.shape[1] for table in tables)
+        self._lacks_room |= any(map(math.isnan, numbers[columns:]))
+        return not all(number < LARGEST for number in numbers[:columns])
+
+    def _content(self) -> list[object]:
+        """Return what a step moves and renders with, which events replace."""
+        field = self._state.field
+        return [field.means, field.cholesky, field.colors, field.region_ids, self._state.renderer]
+
+    def _must_wait(self) -> bool:
+        """Whether the next step waits for the device."""
+        content, last = self._content(), self._last_content
+        return self._lacks_room or len(content) != len(last) or any(map(is_not, content, last))
+
+    def _runs_ahead(self) -> bool:
+        """Whether a render need not wait for the device."""
+        return not self._must_wait() and self._state.iteration >= self._first_iteration + _CHECKED_ITERATIONS
+
+    @contextmanager
+    def _running_ahead(self) -> Iterator[None]:
+        """Render without waiting, where that is possible, and without a graph that no step needs."""
+        with without_waiting() if self._runs_ahead() else nullcontext(), torch.set_grad_enabled(not self._can_replay()):
+            yield
+
+    def _can_replay(self) -> bool:
+        """Whether the next step is a kernel's programs alone, on a GPU."""
+        state = self._state
+        return self._runs_ahead() and state.field.means.is_cuda and state.objective.has_fused_gradients(state.renderer)
+
+
+@torch.no_grad()
+def _magnitudes(tables: list[Tensor]) -> Tensor:
+    """Return the largest absolute number of each column of tables, (N, K) each; a NaN is the largest."""
+    return torch.cat(tables, -1).abs().amax(0)

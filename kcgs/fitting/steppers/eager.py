@@ -1,0 +1,54 @@
+"""What steps and measures a fit, and the form that waits for each step."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from torch import Tensor
+
+from kcgs.fitting.measurement import measure_errors, snapshot
+from kcgs.fitting.state import Errors, FitState, record
+from kcgs.optim import step_field
+
+
+class Stepper(Protocol):
+    """Moves and measures the Gaussians of one fit on its device."""
+
+    def step(self, rate: float) -> None:
+        """Move the Gaussians once, by a factor of the learning rates, and count the iteration."""
+
+    def measure(self, seconds: float) -> None:
+        """Render and measure the scene, so many seconds after the start; the next step differentiates this render."""
+
+    def poll(self, *, wait: bool = False) -> None:
+        """Record the measurements that the device is done with; `wait`: all of them."""
+
+    def has_diverged(self) -> bool:
+        """Whether a number of the field is not finite, or near overflow."""
+
+
+class EagerStepper:
+    """Steps that are complete when they return, on any device."""
+
+    def __init__(self, state: FitState) -> None:
+        self._state = state
+        self._rendered: Tensor | None = None
+
+    def step(self, rate: float) -> None:
+        """See :class:`Stepper`."""
+        rendered, self._rendered = self._rendered, None
+        step_field(self._state, rate, rendered)
+
+    def measure(self, seconds: float) -> None:
+        """See :class:`Stepper`."""
+        state = self._state
+        self._rendered = state.render()
+        errors = Errors(*measure_errors(state.problem, self._rendered).tolist())
+        record(state, snapshot(state, seconds), errors)
+
+    def poll(self, *, wait: bool = False) -> None:
+        """See :class:`Stepper`: all measurements are recorded."""
+
+    def has_diverged(self) -> bool:
+        """See :class:`Stepper`."""
+        return not self._state.is_finite
