@@ -39,7 +39,7 @@ LAYERS = [
     {"errors", "_rows"},
 ]
 # modules beside the `__init__` of a room that other rooms import, two of a room at most: they load numba or Triton
-DOORS = {"kcgs.compiled.program", "kcgs.compiled.tasks", "kcgs.kernels.cuda.program"}
+DOORS = {"kcgs.compiled.program", "kcgs.compiled.tasks", "kcgs.kernels.cuda.triton_function"}
 # what to say: what not to
 REPLACED = {
     "image, render": r"\bpictures?\b|\bdraw(s|n|ing|ings)?\b",

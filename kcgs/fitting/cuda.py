@@ -6,7 +6,7 @@ import torch
 import triton.language as tl
 from torch import Tensor
 
-from kcgs.kernels.cuda.program import program
+from kcgs.kernels.cuda.triton_function import triton_function
 
 # pixels of a program
 _PIXELS = 512
@@ -37,7 +37,7 @@ def blur(planes: Tensor, labels: Tensor | None, sigma: float, norm_sigma: float,
     return planes
 
 
-@program(warps=4)
+@triton_function(warps=4)
 def _blur(  # type: ignore[no-untyped-def]
     planes, labels, blurred, area, stride, length, exponent, norm_exponent, reach,
     MAPPED: tl.constexpr, PIXELS: tl.constexpr,

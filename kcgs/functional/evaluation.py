@@ -18,37 +18,39 @@ from .arguments import NO_MAP, SplatArguments
 from .values import check_region_ids, check_values
 
 
-class Plan(NamedTuple):
-    """A kernel, its inputs, and what it found about them: a forward leaves it for its backward."""
+class Evaluation(NamedTuple):
+    """A kernel, its inputs, and its plan for them: a forward leaves all three for its backward."""
 
     kernel: Kernel
     inputs: SplatInputs
-    content: Any  # what `kernel.plan` returned
+    plan: Any  # in a form of the kernel's own
 
 
-def plan_splat(arguments: SplatArguments, check: bool = True) -> Plan:
+def prepare(arguments: SplatArguments, check: bool = True) -> Evaluation:
     """Prepare Gaussians and map for the kernel that the backend names, with `check` of values."""
     inputs, kernel = _prepare(arguments, check)
-    content = kernel.plan(inputs)
-    if content is None and kernel.checks_values:
+    plan = kernel.plan(inputs)
+    if plan is None and kernel.checks_values:
         check_values(*arguments[:3])
-    if kernel.looks_up_regions and (content is None or (check and content.foreign)):
+    if kernel.looks_up_regions and (plan is None or (check and plan.foreign)):
         _look_up(inputs, True)
-    return Plan(kernel, inputs, content)
+    return Evaluation(kernel, inputs, plan)
 
 
-def render(arguments: SplatArguments, plan: Plan) -> Tensor:
+def render(arguments: SplatArguments, evaluation: Evaluation) -> Tensor:
     """Return the image, with B where the Gaussians have it."""
-    image = plan.kernel.render(plan.content, plan.inputs).contiguous()
+    image = evaluation.kernel.render(evaluation.plan, evaluation.inputs).contiguous()
     return image if image.ndim == arguments.means.ndim + 1 else image.squeeze(0)
 
 
-def differentiate(arguments: SplatArguments, plan: Plan, grad: Tensor, geometry: bool) -> tuple[Tensor, Tensor, Tensor]:
+def differentiate(
+    arguments: SplatArguments, evaluation: Evaluation, grad: Tensor, geometry: bool
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return the gradients of means, cholesky and colors; without `geometry` the first two are empty."""
-    inputs = plan.inputs
+    inputs = evaluation.inputs
     if grad.ndim < inputs.means.ndim + 1:
         grad = grad.unsqueeze(0)
-    gradients = plan.kernel.differentiate(plan.content, inputs, grad, geometry)
+    gradients = evaluation.kernel.differentiate(evaluation.plan, inputs, grad, geometry)
     means, cholesky, colors = [gradients[2].new_empty(0) if g is None else g.contiguous() for g in gradients]
     if colors.ndim == arguments.colors.ndim:
         return means, cholesky, colors
@@ -73,10 +75,11 @@ def squared_error_gradients(
     operands = NO_MAP if regions is None else map_operands(regions)[:-1]
     gaussians = means.detach(), cholesky.detach(), colors.detach()
     arguments = SplatArguments._make((*gaussians, region_ids, *operands, *image.shape[1:], cutoff, backend))
-    plan = plan_splat(arguments)
-    if plan.kernel.error_gradients is None:
-        return differentiate(arguments, plan, render(arguments, plan) - image, True)
-    of_means, of_cholesky, of_colors = plan.kernel.error_gradients(plan.content, plan.inputs, image)
+    evaluation = prepare(arguments)
+    kernel, inputs, plan = evaluation
+    if kernel.error_gradients is None:
+        return differentiate(arguments, evaluation, render(arguments, evaluation) - image, True)
+    of_means, of_cholesky, of_colors = kernel.error_gradients(plan, inputs, image)
     assert of_means is not None and of_cholesky is not None
     return of_means, of_cholesky, of_colors
 

@@ -1,7 +1,7 @@
 """`kcgs::region_splat`, the operator that torch's tools see: its schema, derivatives, shapes and vmap.
 
-All enters as tensors and numbers; `evaluation` computes. The plan of a forward is kept for its backward on autograd's
-context, which neither compilers nor transforms see: they plan again.
+All enters as tensors and numbers; `evaluation` computes. What a forward has prepared is kept for its backward on
+autograd's context, which neither compilers nor transforms see: they prepare again.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from .arguments import SplatArguments
-from .evaluation import Plan, differentiate, differentiate_forward, differentiate_twice, plan_splat, render
+from .evaluation import Evaluation, differentiate, differentiate_forward, differentiate_twice, prepare, render
 from .torch_internals import (
     apply,
     below_autograd,
@@ -64,10 +64,10 @@ class _Splat(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> Tensor:
         image: Tensor
-        if _is_plain(arguments[:3]):  # the plan stays on this side of the operator
-            image, ctx.plan = below_autograd(_render_planned, SplatArguments(*arguments))
+        if _is_plain(arguments[:3]):  # what is prepared stays on this side of the operator
+            image, ctx.evaluation = below_autograd(_render, SplatArguments(*arguments))
         else:
-            image, ctx.plan = _unrecorded(splat_operator, *arguments), None
+            image, ctx.evaluation = _unrecorded(splat_operator, *arguments), None
         ctx.save_for_backward(*arguments[:3])
         ctx.save_for_forward(*arguments[:3])
         _keep_constants(ctx, arguments[3:])
@@ -83,13 +83,13 @@ class _Splat(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         means, cholesky, colors = ctx.needs_input_grad[:3]
         gaussians, geometry = ctx.saved_tensors, means or cholesky
-        if ctx.plan is not None and _is_plain((grad, *gaussians)) and not torch.is_grad_enabled():
+        if ctx.evaluation is not None and _is_plain((grad, *gaussians)) and not torch.is_grad_enabled():
             arguments = SplatArguments(*gaussians, *ctx.constants)
-            gradients = below_autograd(differentiate, arguments, ctx.plan, grad, geometry)
+            gradients = below_autograd(differentiate, arguments, ctx.evaluation, grad, geometry)
         else:
             gradients = _backward_operator(grad, *gaussians, *_constants(ctx), geometry)
         if not is_graph_retained():
-            ctx.plan = None  # as torch frees what is saved: a loss that stays alive holds no plan
+            ctx.evaluation = None  # as torch frees what is saved: a loss that stays alive holds none
         needed = zip(gradients, (means, cholesky, colors), strict=True)
         return (*(g if need else None for g, need in needed), *[None] * _NUM_CONSTANTS)
 
@@ -204,17 +204,17 @@ def _unrecorded(operator: Any, *arguments: Any) -> Any:
 
 
 def _splat(*arguments: Any) -> Tensor:
-    return _render_planned(SplatArguments(*arguments))[0]
+    return _render(SplatArguments(*arguments))[0]
 
 
-def _render_planned(arguments: SplatArguments) -> tuple[Tensor, Plan]:
-    plan = plan_splat(arguments)
-    return render(arguments, plan), plan
+def _render(arguments: SplatArguments) -> tuple[Tensor, Evaluation]:
+    evaluation = prepare(arguments)
+    return render(arguments, evaluation), evaluation
 
 
 def _splat_backward(grad: Tensor, *arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
     gaussians = SplatArguments(*arguments[:-1])
-    return differentiate(gaussians, plan_splat(gaussians, check=False), grad, arguments[-1])
+    return differentiate(gaussians, prepare(gaussians, check=False), grad, arguments[-1])
 
 
 def _splat_double_backward(*arguments: Any) -> tuple[Tensor, ...]:

@@ -12,7 +12,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from kcgs.kernels.cuda.program import program
+from kcgs.kernels.cuda.triton_function import triton_function
 
 from .settings import Adam, Bounds
 
@@ -93,7 +93,7 @@ def _add(table, place, change, mask):  # type: ignore[no-untyped-def]
     _store(table, place, tl.load(table + place, mask=mask, other=0.0) + change, mask)
 
 
-@program(warps=4)
+@triton_function(warps=4)
 def _step(  # type: ignore[no-untyped-def]
     means, cholesky, colors, opacities, means_gradient, cholesky_gradient, colors_gradient, opacities_gradient,
     lr, beta1, beta2, eps, age, average, square,

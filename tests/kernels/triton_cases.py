@@ -15,7 +15,7 @@ from kcgs import GaussianField, RegionMap, RegionSplatRenderer
 from kcgs.functional import region_splat
 from kcgs.functional.operator import splat_operator
 from kcgs.kernels import SplatInputs, cuda, reference, settle, without_waiting
-from kcgs.kernels.cuda import capacity, gather, plan, program, render
+from kcgs.kernels.cuda import capacity, gather, plan, render, triton_function
 from kcgs.maps import Membership, find_widths
 from kcgs.maps.widths import blurs_of
 from kcgs.optim import GaussianAdam
@@ -23,7 +23,7 @@ from kcgs.optim import GaussianAdam
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 GPU = DEVICE.type == "cuda"
 needs_gpu = pytest.mark.skipif(not GPU, reason="a CUDA graph needs a GPU")
-if program.is_interpreted():
+if triton_function.is_interpreted():
     # it would patch the whole language anew at every call of a function; plain Python is a part of what calls it
     render.weigh = gather.weigh = render.weigh.fn
 

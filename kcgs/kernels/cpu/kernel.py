@@ -35,7 +35,7 @@ _THREAD_LISTED_PAIRS = 3000
 _THREAD_PAIRS = 300
 
 
-class Plan(NamedTuple):
+class CpuPlan(NamedTuple):
     """The lists of a render, and the memory that they are in."""
 
     lists: Lists
@@ -53,7 +53,7 @@ def kernel_for(inputs: SplatInputs) -> Kernel:
     )
 
 
-def plan(inputs: SplatInputs) -> Plan | None:
+def plan(inputs: SplatInputs) -> CpuPlan | None:
     """List which Gaussians touch which blocks; None where a value is out of range."""
     means, cholesky, colors = (_array(t) for t in inputs.gaussians)
     if inputs.membership is not None and inputs.region_index is not None:
@@ -66,7 +66,7 @@ def plan(inputs: SplatInputs) -> Plan | None:
     return _list_pairs(batch, table, order, inputs.cutoff) if is_valid else None
 
 
-def _list_pairs(batch: Batch, table: Table, order: Any, cutoff: float) -> Plan:
+def _list_pairs(batch: Batch, table: Table, order: Any, cutoff: float) -> CpuPlan:
     radius, least = support_radius(cutoff, torch.float32), least_exponent(cutoff, torch.float32)
     count, blocks = len(order), len(table.parents)
     copies = batch.num_images if table.num_maps == 1 else 1
@@ -93,7 +93,7 @@ def _list_pairs(batch: Batch, table: Table, order: Any, cutoff: float) -> Plan:
         # the phases of one range follow each other: another thread would only wait
         threads = min(1 + total // _THREAD_LISTED_PAIRS, parts)
         run_tasks(partial(list_pairs, batch, radius, spans, found, histogram, lists), listing, threads)
-    return Plan(lists, workspace)
+    return CpuPlan(lists, workspace)
 
 
 @functools.lru_cache(maxsize=64)
@@ -136,7 +136,7 @@ def _table(starts: Any, regions: Any, planes: Any, masks: Any, num_regions: int,
     return Table(num_regions, shape[0], np.array(grids), regions, tile_start, parents, parity, planes, masks)
 
 
-def render(plan: Plan, inputs: SplatInputs) -> Tensor:
+def render(plan: CpuPlan, inputs: SplatInputs) -> Tensor:
     """Render (B, C, H, W)."""
     *batch, _, channels = inputs.colors.shape
     # numpy asks for huge pages where an array is large: first use costs a quarter of what torch.empty's does
@@ -149,18 +149,18 @@ def render(plan: Plan, inputs: SplatInputs) -> Tensor:
     return torch.from_numpy(image)
 
 
-def differentiate(plan: Plan, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
+def differentiate(plan: CpuPlan, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
     """Return the gradients of means, cholesky (None each without `geometry`) and colors."""
     means, cholesky, colors = _gather(plan, inputs, grad, GATHERS)
     return (means, cholesky, colors) if geometry else (None, None, colors)
 
 
-def error_gradients(plan: Plan, inputs: SplatInputs, target: Tensor) -> Gradients:
+def error_gradients(plan: CpuPlan, inputs: SplatInputs, target: Tensor) -> Gradients:
     """Return the gradients of half the squared error, summed over the pixels, against (B, C, H, W)."""
     return _gather(plan, inputs, target, ADDS | GATHERS)
 
 
-def _gather(plan: Plan, inputs: SplatInputs, image: Tensor, kind: int) -> tuple[Tensor, Tensor, Tensor]:
+def _gather(plan: CpuPlan, inputs: SplatInputs, image: Tensor, kind: int) -> tuple[Tensor, Tensor, Tensor]:
     lists, channels = plan.lists, inputs.colors.shape[-1]
     means, cholesky, colors = (torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs.gaussians)
     gradients = (t.view(-1, t.shape[-1]).numpy() for t in (means, cholesky, colors))

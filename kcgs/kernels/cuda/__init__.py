@@ -52,6 +52,6 @@ def _kernel() -> Kernel:
 def _is_interpreted() -> bool:
     if not _has_triton():
         return False
-    from .program import is_interpreted
+    from .triton_function import is_interpreted
 
     return is_interpreted()

@@ -1,8 +1,9 @@
-"""Room for the lists of a plan where nothing may wait for the device: in a CUDA graph, and from step to step of a fit.
+"""Room for the lists of a plan where the host does not wait for the device: in a CUDA graph, and in steps of a fit.
 
-An eager call waits for the number of slots. Elsewhere there is room for 1.5 times the most that was seen for the size,
-and 65,536 more, since few wide Gaussians grow fastest. What does not fit, or is not finite, gives NaN, and is noted
-on the device; whoever waits next reads the note.
+An eager plan reads its number of slots from the device. Elsewhere the lists have room for 1.5 times the largest number
+that was seen for the size, and 65,536 slots more, since the number grows fastest where Gaussians are few and wide. A
+plan that does not fit, or whose values are not finite, renders NaN and adds to counters on the device. The next eager
+plan reads and reports the counters of CUDA graphs; `settle` reads those of a fit.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ _MOST_SLOTS = (1 << 31) - 1
 
 # slots of the largest plan of a device, a number of images and a size
 _most: dict[tuple[torch.device, int, tuple[int, int]], int] = {}
-# of each device, int64: plans whose lists did not fit, whose values were not finite, and the most slots of one; False:
-# of plans within `without_waiting`
+# counters of each device, int64: plans whose lists did not fit, plans whose values were not finite, and the most slots
+# of one; with False those of plans within `without_waiting`
 _notes: dict[tuple[torch.device, bool], Tensor] = {}
 _waits: ContextVar[bool] = ContextVar("whether plans wait for the device", default=True)
 
@@ -81,12 +82,12 @@ def _too_many(inputs: SplatInputs, slots: int) -> ValueError:
 
 
 def reports() -> bool:
-    """Whether a plan that waits reads what was noted; within `without_waiting`, `settle` does."""
+    """Whether the host waits for a plan, which then reads the counters; within `without_waiting`, `settle` does."""
     return _waits.get()
 
 
 def report(full: int, not_finite: int, most: int) -> None:
-    """Warn of what was noted."""
+    """Warn where counters are not 0."""
     if full:
         warn_user(
             f"{full} renders of a CUDA graph are NaN: their Gaussians touch up to {most} tiles of 16 x 16 pixels, and "
@@ -108,7 +109,7 @@ def settle(device: torch.device, size: tuple[int, int]) -> bool:
 
 
 def notes_of(device: torch.device) -> Tensor:
-    """Return what plans of the device note, here."""
+    """Return the counters of a device for plans here."""
     key = device, _waits.get()
     if key not in _notes:
         with torch.inference_mode(False):

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from ..interface import Gradients, SplatInputs
 from .capacity import room_for
-from .plan import PIECE, PIECES, SCALE, SIDE, Plan, fails
-from .program import program
+from .plan import PIECE, PIECES, SCALE, SIDE, CudaPlan, fails
 from .render import channels_at_once, lists_of, render, weigh
+from .triton_function import triton_function
 
 # parts of a tile's rows, one for each thread of a pair
 _PARTS = tl.constexpr(4)
@@ -25,7 +25,7 @@ _UNROLL = tl.constexpr(2)
 _SLOTS, _COLUMNS = 64, 8
 
 
-def differentiate(plan: Plan, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
+def differentiate(plan: CudaPlan, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
     """Return the gradients of means, cholesky (None each without `geometry`) and colors."""
     _, cholesky, colors = (t.contiguous() for t in inputs.gaussians)
     channels, total = colors.shape[-1], colors.shape[:-1].numel()
@@ -48,12 +48,12 @@ def differentiate(plan: Plan, inputs: SplatInputs, grad: Tensor, geometry: bool)
     return means_grad, cholesky_grad, grads[-1]
 
 
-def error_gradients(plan: Plan, inputs: SplatInputs, target: Tensor) -> Gradients:
+def error_gradients(plan: CudaPlan, inputs: SplatInputs, target: Tensor) -> Gradients:
     """Return the gradients of half the squared error, summed over the pixels, against (B, C, H, W)."""
     return differentiate(plan, inputs, render(plan, inputs, target), True)
 
 
-@program(warps=1)
+@triton_function(warps=1)
 def _gather(  # type: ignore[no-untyped-def]
     terms, grad, colors, pieces, num_pieces,
     counters, lists, slots, coefficients, weights,
@@ -133,7 +133,7 @@ def _store(address, sums, first, end, columns):  # type: ignore[no-untyped-def]
     tl.store(address + pair.to(tl.int64) * columns, tl.sum(tl.reshape(sums, [_PARTS, PIECE]), axis=0), mask=pair < end)
 
 
-@program(warps=2)
+@triton_function(warps=2)
 def _reduce(  # type: ignore[no-untyped-def]
     terms, cholesky, counters, gaussians, slots, means_grad, cholesky_grad, colors_grad, total, room, channels,
     GEOMETRY: tl.constexpr, BLOCK: tl.constexpr, COLUMNS: tl.constexpr,

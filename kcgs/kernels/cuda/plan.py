@@ -22,7 +22,7 @@ from ..tiles import MARGIN, RELATIVE_MARGIN, TileGrid, grid_of
 from ..whitened import MEAN_LIMIT, SCALE_LIMITS, Z_LIMIT, support_radius
 from ..whitened import SCALE as EXPONENT_SCALE
 from .capacity import notes_of, remember, report, reports, reserve, room_for
-from .program import program
+from .triton_function import triton_function
 
 # Gaussians of a program of `_prepare`, and of a step of the others
 _PREPARE_BLOCK, _BIN_BLOCK, _TILE_BLOCK = 128, 1024, 128
@@ -43,18 +43,18 @@ _MEAN_LIMIT = tl.constexpr(MEAN_LIMIT)
 _LEAST_SCALE = tl.constexpr(float(np.float32(SCALE_LIMITS[0] * (1 - 1e-6))))
 _MOST_SCALE = tl.constexpr(SCALE_LIMITS[1])
 
-# places in Plan.counters, int64
+# places in CudaPlan.counters, int64
 SLOTS = tl.constexpr(0)  # tiles of all boxes
 INVALID = tl.constexpr(1)  # Gaussians whose values are not finite or out of range, or whose region id is negative
 _FOREIGN = tl.constexpr(2)  # Gaussians whose region id the map does not hold
 _ENTRIES = tl.constexpr(3)  # of the cells' lists
 _PAIRS = tl.constexpr(4)  # places of the tiles' lists
 PIECES = tl.constexpr(5)
-_NOTES = tl.constexpr(6)  # what was noted on the device before, see capacity.py
+_NOTES = tl.constexpr(6)  # the counters of earlier plans, see capacity.py
 _COUNTERS = 9
 
 
-class Plan(NamedTuple):
+class CudaPlan(NamedTuple):
     """The lists of a batch of images, whose Gaussians are numbered through."""
 
     counters: Tensor  # [9] int64
@@ -74,7 +74,7 @@ class Plan(NamedTuple):
         return self.coefficients.shape[0]
 
 
-def plan(inputs: SplatInputs) -> Plan | None:
+def plan(inputs: SplatInputs) -> CudaPlan | None:
     """List the pairs; None where a value is not finite or out of range, or a region id is negative."""
     means, cholesky, colors = (t.contiguous() for t in inputs.gaussians)
     count, channels = colors.shape[-2:]
@@ -121,10 +121,10 @@ def plan(inputs: SplatInputs) -> Plan | None:
             map_tiles, total, room, num_cells, grid.total, grid.rows, grid.cols, cell_rows, cell_cols, pieces.shape[1],
             radius, MAPPED=num_ids > 0, BLOCK=_TILE_BLOCK,
         )  # fmt: skip
-    return Plan(counters, gaussians, lists, slots, coefficients, pieces, weights, grid, num_cells, foreign)
+    return CudaPlan(counters, gaussians, lists, slots, coefficients, pieces, weights, grid, num_cells, foreign)
 
 
-@program(warps=4)
+@triton_function(warps=4)
 def _prepare(  # type: ignore[no-untyped-def]
     means, cholesky, colors, region_ids, ids, counters, gaussians, notes,
     total, num_ids, steps, height, width, channels, radius,
@@ -199,7 +199,7 @@ def _box(gaussians, g, total, mask):  # type: ignore[no-untyped-def]
     return first & 0xFFFF, first >> 16, last & 0xFFFF, last >> 16
 
 
-@program(warps=8)
+@triton_function(warps=8)
 def _bin(  # type: ignore[no-untyped-def]
     gaussians, counters, lists, slots, notes, total, count, room, num_lists, cell_rows, cell_cols,
     NOTES: tl.constexpr, BLOCK: tl.constexpr,
@@ -241,7 +241,7 @@ def _overlaps(x0, y0, x1, y1, left, top):  # type: ignore[no-untyped-def]
     return touches & (y0 <= y1)
 
 
-@program(warps=4)
+@triton_function(warps=4)
 def _tile(  # type: ignore[no-untyped-def]
     means, cholesky, counters, gaussians, lists, slots, coefficients, pieces, starts, regions, planes,
     map_tiles, total, room, num_cells, num_tiles, rows, cols, cell_rows, cell_cols, num_pieces, radius,

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from ..interface import SplatInputs
 from ..whitened import least_exponent
-from .plan import SIDE, Plan, fails
-from .program import program
+from .plan import SIDE, CudaPlan, fails
+from .triton_function import triton_function
 
 # channels that a thread holds at once, in registers
 _MAX_CHANNELS = 4
@@ -23,7 +23,7 @@ _UNROLL = tl.constexpr(4)
 _LEAST_WEIGHT = math.exp(least_exponent(0.0, torch.float32))
 
 
-def render(plan: Plan, inputs: SplatInputs, target: Tensor | None = None) -> Tensor:
+def render(plan: CudaPlan, inputs: SplatInputs, target: Tensor | None = None) -> Tensor:
     """Render (B, C, H, W), without B where the Gaussians have none, minus the target where there is one."""
     grid, channels, (height, width) = plan.grid, inputs.colors.shape[-1], inputs.size
     image = torch.empty(
@@ -39,7 +39,7 @@ def render(plan: Plan, inputs: SplatInputs, target: Tensor | None = None) -> Ten
     return image
 
 
-def lists_of(plan: Plan, inputs: SplatInputs) -> tuple[Any, ...]:
+def lists_of(plan: CudaPlan, inputs: SplatInputs) -> tuple[Any, ...]:
     """Return what the programs of image and gradients read of a plan and a map."""
     grid, arrays = plan.grid, (plan.counters, plan.lists, plan.slots, plan.coefficients, plan.weights)
     return *arrays, plan.room, plan.num_cells, grid.total, grid.rows, grid.cols, max(inputs.cutoff, _LEAST_WEIGHT)
@@ -59,7 +59,7 @@ def weigh(k0, k1, k2, k3, k4, x, y, cutoff):  # type: ignore[no-untyped-def]
     return z1, z2, tl.where(weight >= cutoff, weight, 0.0)
 
 
-@program(warps=2)
+@triton_function(warps=2)
 def _render(  # type: ignore[no-untyped-def]
     image, target, colors, counters, lists, slots, coefficients, weights,
     room, num_cells, num_tiles, rows, cols, cutoff, height, width, channels,

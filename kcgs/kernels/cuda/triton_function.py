@@ -10,7 +10,7 @@ import triton
 from torch import Tensor
 
 
-class Program:
+class TritonFunction:
     """A function of tensors, numbers and, last, constants, which is compiled once for each set of these."""
 
     def __init__(self, function: Any, warps: int) -> None:
@@ -36,12 +36,12 @@ class Program:
         compiled[(*grid, 1, 1)[:3]](*values, *constants.values())
 
 
-def program(warps: int) -> Callable[[Any], Program]:
-    """Decorate a function to be a program of so many warps, of 32 threads each."""
-    return lambda function: Program(function, warps)
+def triton_function(warps: int) -> Callable[[Any], TritonFunction]:
+    """Decorate a function of Triton's, whose programs have so many warps, of 32 threads each."""
+    return lambda function: TritonFunction(function, warps)
 
 
 @functools.cache
 def is_interpreted() -> bool:
     """Whether TRITON_INTERPRET=1 was set when triton was imported: programs run in numpy, on CPU tensors."""
-    return not isinstance(triton.jit(program), triton.JITFunction)
+    return not isinstance(triton.jit(triton_function), triton.JITFunction)
