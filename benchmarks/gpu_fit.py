@@ -73,7 +73,7 @@ def warm_up(config: FitConfig, n: int, size: tuple[int, int], has_labels: bool, 
     """Fit noise of this size, so that everything is compiled."""
     noise = torch.rand(3, *size, generator=torch.Generator().manual_seed(0)).to(device)
     labels = (noise[0].cumsum(1) > size[1] / 4).long() if has_labels else None
-    short = config.model_copy(update={"iterations": min(WARM_UP_ITERATIONS, config.num_iterations)})
+    short = config.model_copy(update={"iterations": min(WARM_UP_ITERATIONS, config.planned_iterations)})
     finish(lambda: fit(noise, labels, n, recipe=short))
 
 

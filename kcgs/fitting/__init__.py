@@ -1,17 +1,20 @@
 """An image in, a scene out."""
 
+from .checks import check_image_and_regions
 from .config import FitConfig, available_recipes
 from .contour_moves import move_contours
 from .initial import initial_field
 from .loop import fit, fit_problem, precompile
-from .problem import Problem, check_image_and_regions, make_problem
+from .problem import Problem, make_problem
 from .pursuit import propose_for, propose_gaussians
 from .region_report import RegionReport, report_regions
 from .removal import lowest_impact, lowest_weighted_impact
 from .result import FitResult, HistoryEntry
+from .state import FitState
+from .user_objects import Densifier
 
 # public; what else is imported here is for the other rooms of kcgs
 __all__ = [
-    "FitConfig", "FitResult", "HistoryEntry", "RegionReport", "available_recipes", "fit", "initial_field",
-    "lowest_impact", "precompile", "propose_gaussians",
+    "Densifier", "FitConfig", "FitResult", "FitState", "HistoryEntry", "RegionReport", "available_recipes", "fit",
+    "initial_field", "lowest_impact", "precompile", "propose_gaussians",
 ]  # fmt: skip

@@ -26,9 +26,6 @@ from .state import FitState
 _RUN_PER_WRITE = 100.0
 _VERSION = 9
 _DIGEST_SIZE = 32  # bytes of the SHA-256 of the content, which begins the file
-# all fields of the state that are numbers
-_NUMBERS = [field.name for field in fields(FitState) if field.type in ("int", "float", "bool")]
-_NUMBERS.remove("progress")  # the clock may give it anew
 
 
 class Checkpoint:
@@ -44,7 +41,7 @@ class Checkpoint:
 
         So writing takes about a hundredth of the fit.
         """
-        return time.perf_counter() >= self._next_write or state.iteration >= self.problem.config.max_iterations
+        return time.perf_counter() >= self._next_write or state.iteration >= self.problem.config.iteration_limit
 
     def write(self, state: FitState, seconds: float) -> None:
         """Put the state, and the seconds of the fit so far, in the file's place."""
@@ -86,7 +83,7 @@ def _fingerprint(problem: Problem) -> str:
 def _to_plain(state: FitState) -> dict[str, Any]:
     """Return tensors, numbers, strings, lists and dicts, which load without running code."""
     return {
-        **{name: getattr(state, name) for name in _NUMBERS},
+        "numbers": _numbers(state),
         "cutoff": state.renderer.cutoff,
         "scene": _scene_to_plain(state.scene),
         "best": None if state.best is None else _scene_to_plain(state.best),
@@ -96,6 +93,12 @@ def _to_plain(state: FitState) -> dict[str, Any]:
     }
 
 
+def _numbers(state: FitState) -> dict[str, float]:
+    """Return the fields of a state that are numbers, but its progress, which the clock may give anew."""
+    values = {field.name: getattr(state, field.name) for field in fields(state) if field.name != "progress"}
+    return {name: value for name, value in values.items() if isinstance(value, int | float)}
+
+
 def _from_plain(plain: dict[str, Any], problem: Problem) -> FitState:
     scene = _scene_from_plain(plain["scene"], problem.size)
     state = make_state(
@@ -103,7 +106,7 @@ def _from_plain(plain: dict[str, Any], problem: Problem) -> FitState:
         anchor=None if plain["anchor"] is None else RegionMap.from_state(plain["anchor"]),
         history=[HistoryEntry(*entry) for entry in plain["history"]],
         best=None if plain["best"] is None else _scene_from_plain(plain["best"], problem.size),
-        **{name: plain[name] for name in _NUMBERS},
+        **plain["numbers"],
     )  # fmt: skip
     state.renderer = state.renderer._replace(cutoff=plain["cutoff"])
     state.optimizer.load_state_dict(plain["optimizer"])

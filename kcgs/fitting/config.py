@@ -64,7 +64,7 @@ class FitConfig(BaseModel):
     )
     densify_from: float = Field(0.01, gt=0.0, le=1.0, description="fraction of N at the start; the rest is added later")
     warmup: bool = Field(
-        False, description="in the first half of the fit, Gaussians take the region ids under their centres"
+        False, description="in the first half of the iterations, Gaussians take the region ids under their centres"
     )
     prune: float = Field(1e-3, ge=0.0, description="remove Gaussians that change no value by more, at the end; 0: none")
 
@@ -125,14 +125,14 @@ class FitConfig(BaseModel):
             raise InvalidArgument("max_move", "'any' or at least 1 pixel", repr(self.max_move))
 
     @property
-    def num_iterations(self) -> int:
+    def planned_iterations(self) -> int:
         """Iterations of a fit that no clock ends."""
         return self.iterations or _USUAL_ITERATIONS
 
     @property
-    def max_iterations(self) -> float:
+    def iteration_limit(self) -> float:
         """Iterations of a fit; infinite where the clock alone ends it."""
-        return math.inf if self.iterations is None and self.max_seconds is not None else self.num_iterations
+        return math.inf if self.iterations is None and self.max_seconds is not None else self.planned_iterations
 
     def __repr__(self) -> str:
         changed = [(name, value) for name, value in self if value != type(self).model_fields[name].default]

@@ -124,7 +124,7 @@ class MovingLabels:
         self._sweeps = SweepState(np.ones(padded.size, np.uint8), counts)
 
     def fix_cores(self, rim: Mask, distance: int) -> None:
-        """Fix the pixels that each region keeps, unless it has that many beyond the distance that contours move."""
+        """Pin the deepest pixels of the regions that moves of contours, up to a distance, could otherwise erase."""
         depth, is_near = np.zeros(rim.shape, np.int16), rim
         for _ in range(distance + 1):  # in squares around the rim: a distance transform takes ten times as long
             depth += ~is_near

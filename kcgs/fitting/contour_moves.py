@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from kcgs.functional import RegionMap, edge_band
+from kcgs.optim import Gaussians, Renderer
 from kcgs.scene import Scene
 
 from .config import FitConfig
@@ -64,25 +64,25 @@ def refine_contours(
 
 
 def move_contours(
-    scene: Scene,
-    image: Tensor,
-    anchor: Tensor,
-    config: FitConfig,
-    squared_error: Callable[[RegionMap], Tensor],
-    max_rise: float,
+    gaussians: Gaussians, renderer: Renderer, image: Tensor, anchor: Tensor, config: FitConfig, max_rise: float
 ) -> RegionMap:
-    """Refine the contours of a scene, and accept the moves that do not raise the squared error about them too much.
+    """Refine the contours of a map, and accept the moves that do not raise the squared error about them too much.
 
     Args:
-        scene: Gaussians and the map.
+        gaussians: of one image.
+        renderer: with the map.
         image: (C, H, W).
         anchor: labels (H, W) that contours may not move far from.
         config: how far, and what a pixel of contour costs.
-        squared_error: of each pixel with a map, (H, W).
-        max_rise: factor by which a move may raise it.
+        max_rise: factor by which a move may raise the squared error.
     """
-    regions = scene.regions
+    regions = renderer.regions
     assert regions is not None
+
+    def squared_error(regions: RegionMap) -> Tensor:
+        return renderer._replace(regions=regions).squared_error(gaussians, image)
+
+    scene = Scene(gaussians.field(renderer.size), regions)
     proposal = refine_contours(
         scene, image, anchor=anchor, max_distance=None if config.max_move == "any" else config.max_move,
         length_weight=config.contour_cost, backend=config.backend,

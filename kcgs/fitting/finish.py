@@ -7,6 +7,7 @@ import torch
 from kcgs.optim import Gaussians
 from kcgs.pruning import prune
 
+from .clock import Clock
 from .measurement import measure_errors, snapshot
 from .region_report import report_regions
 from .removal import remove_gaussians
@@ -14,15 +15,16 @@ from .result import FitResult, StopReason
 from .state import Errors, FitState, Measurement, record
 
 
-def finish(state: FitState, reason: StopReason, seconds: float) -> FitResult:
+def finish(state: FitState, reason: StopReason, clock: Clock) -> FitResult:
     """Measure the last scene, take the best, and prune it; return a fit that ended for a reason."""
-    problem, config, best_draft = state.problem, state.problem.config, state.best
+    problem, config, best_draft, seconds = state.problem, state.problem.config, state.best, clock.seconds()
     with torch.no_grad():
         if state.is_draft:
             state.end_drafts()
             if best_draft is not None:
                 renderer = state.renderer._replace(regions=best_draft.regions)
                 errors = measure_errors(problem, renderer.render(Gaussians.of(best_draft.field)))
+                # the draft was measured before, with another cutoff
                 measurement = Measurement(state.iteration, seconds, best_draft, is_draft=False)
                 record(state, measurement, Errors(*errors.tolist()))
         if reason != "diverged" and state.is_finite:
@@ -34,4 +36,4 @@ def finish(state: FitState, reason: StopReason, seconds: float) -> FitResult:
     if config.prune > 0:
         scene, num_pruned, prune_error = prune(scene, config.prune, cutoff=config.cutoff, backend=config.backend)
     report = report_regions(problem.regions, scene, dropped=None if config.guidance else "recipe")
-    return FitResult(scene, state.history, reason, config, num_pruned, prune_error, report, seconds)
+    return FitResult(scene, state.history, reason, config, num_pruned, prune_error, report, clock.seconds())

@@ -15,7 +15,7 @@ from kcgs.functional import RegionMap
 from kcgs.maps import as_region_map
 from kcgs.nn import GaussianField
 
-from .problem import check_image_and_regions, check_num_gaussians
+from .checks import check_image_and_regions, check_num_gaussians
 
 # sum of the weights of Gaussians of half the spacing at a pixel
 OVERLAP = math.pi / 2

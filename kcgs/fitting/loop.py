@@ -21,7 +21,6 @@ from kcgs.optim import End, Event, Loss, run
 from .checkpoint import Checkpoint
 from .clock import Clock
 from .config import FitConfig
-from .custom import Densifier, split_names
 from .events import Log, OnStep, Report, StopAtDivergence
 from .finish import finish
 from .optimizers import optimizer_kind
@@ -32,6 +31,7 @@ from .search import search
 from .start import start
 from .state import FitState
 from .steppers import Stepper, make_stepper
+from .user_objects import Densifier, split_names
 
 
 @torch.inference_mode(False)
@@ -113,12 +113,12 @@ def fit(
         >>> result.history[-1].psnr > 20, result.scene.regions.num_regions
         (True, 2)
     """
-    named, custom = split_names(objective=objective, densify=densify, optimizer=optimizer)
+    named, objects = split_names(objective=objective, densify=densify, optimizer=optimizer)
     config = FitConfig.from_recipe(recipe, **named, **settings)
-    problem = make_problem(image, regions, num_gaussians, config, seed, custom, size=size, channels=channels)
+    problem = make_problem(image, regions, num_gaussians, config, seed, objects, size=size, channels=channels)
     if resume and checkpoint is None:
         raise InvalidArgument("checkpoint", "a file to go on from, with resume", None)
-    own = [name for name, value in custom._asdict().items() if value is not None]
+    own = [name for name, value in objects._asdict().items() if value is not None]
     if own and checkpoint is not None:
         raise InvalidArgument("checkpoint", f"None with {own[0]} of your own, which no file keeps", repr(checkpoint))
     if config.target_psnr is not None and checkpoint is not None:
@@ -132,7 +132,7 @@ def precompile(config: FitConfig, device: torch.device | str = "cpu") -> None:
     ramp = torch.linspace(0.0, 1.0, 96, device=device)
     image = torch.stack([ramp.expand(64, 96), 1 - ramp.expand(64, 96), (8 * ramp).sin().square().expand(64, 96)])
     labels = (ramp > 0.6).long().expand(64, 96).contiguous()
-    iterations = min(config.num_iterations, 20)
+    iterations = min(config.planned_iterations, 20)
     update: dict[str, Any] = {"iterations": iterations, "max_seconds": None, "target_psnr": None, "backend": "auto"}
     fit(image, labels, 24, recipe=config.model_copy(update=update))
 
@@ -177,7 +177,7 @@ def _run(
 ) -> FitResult:
     """Take a fit from its state to its end: events act, the stepper steps."""
     config, stepper = state.problem.config, stepper_of(state)
-    limit, max_seconds = config.max_iterations, config.max_seconds or math.inf
+    limit, max_seconds = config.iteration_limit, config.max_seconds or math.inf
 
     def progress() -> float:
         return min(1.0, max(state.iteration / limit, clock.seconds() / max_seconds))
@@ -188,15 +188,13 @@ def _run(
     events: list[Event] = [report, end, StopAtDivergence(stepper), *schedule, log]
     reason = run(state, stepper.step, progress, events, optimizer_kind(state.problem).rate)
     stepper.poll(wait=True)
-    return finish(state, cast(StopReason, reason), clock.seconds())
+    return finish(state, cast(StopReason, reason), clock)
 
 
 def _warn_of_regions(problem: Problem) -> None:
     """Warn where there are more regions than Gaussians."""
-    most, count = problem.num_gaussians, 0 if problem.regions is None else problem.regions.num_regions
-    if count <= most or not problem.config.guidance:
+    if problem.num_excess_regions == 0 or problem.regions is None:
         return
-    effect = f"{count - most} of {count} regions get no Gaussian and stay black"
-    if problem.config.merge_regions:
-        effect = f"{count - most} of {count} regions were merged with others"
-    warn_user(f"{effect}: there are more than num_gaussians, {most}")
+    effect = "were merged with others" if problem.config.merge_regions else "get no Gaussian and stay black"
+    regions = f"{problem.num_excess_regions} of {problem.regions.num_regions} regions {effect}"
+    warn_user(f"{regions}: there are more than num_gaussians, {problem.num_gaussians}")

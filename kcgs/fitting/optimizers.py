@@ -29,7 +29,7 @@ class OptimizerKind(NamedTuple):
 
 def optimizer_kind(problem: Problem) -> OptimizerKind:
     """Return the kind that the settings name, or one around a user's function from a field to an optimizer."""
-    make = problem.custom.optimizer
+    make = problem.objects.optimizer
     if make is not None:
         return OptimizerKind(lambda config, field, sigma: make(field), cosine_decay, True, True)
     return _KINDS[problem.config.optimizer]
@@ -43,7 +43,7 @@ def _gaussian_adam(config: FitConfig, field: GaussianField, sigma: float) -> Any
 
 
 def _adan(config: FitConfig, field: GaussianField, sigma: float) -> Any:
-    return GaussianImageAdan(field, sigma, config.num_iterations, config.learning_rate_factor)
+    return GaussianImageAdan(field, sigma, config.planned_iterations, config.learning_rate_factor)
 
 
 def _adam(config: FitConfig, field: GaussianField, sigma: float) -> Any:

@@ -10,16 +10,15 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_count, check_size
-from kcgs._image import as_image
 from kcgs._objectives import Purpose, objective_for
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap, edge_band
-from kcgs.maps import as_region_map
 from kcgs.optim import OBJECTIVES, ImageObjective, LossObjective, MsSsim, Objective
 
+from .checks import check_image_and_regions, check_num_gaussians, regions_of
 from .config import FitConfig
-from .custom import NONE, Custom
 from .published.ssim_loss import AbsoluteAndSsim
+from .user_objects import NO_OBJECTS, UserObjects
 
 _OBJECTIVES: dict[str, type[ImageObjective]] = {**OBJECTIVES, "l1+ssim": AbsoluteAndSsim}
 # of every value, where there is no image
@@ -39,9 +38,9 @@ class Problem:
     num_gaussians: int
     """N, the most that the result may have."""
     config: FitConfig
-    """Its objective is a name, unless `custom` has one."""
+    """Its objective is a name, unless `objects` has one."""
     seed: int
-    custom: Custom = NONE
+    objects: UserObjects = NO_OBJECTS
     has_image: bool = True
     """False: only the objective says what is wanted."""
     reduction: int = 1
@@ -84,6 +83,13 @@ class Problem:
         return edge_band(self.regions.labels).nonzero().contiguous()
 
     @property
+    def num_excess_regions(self) -> int:
+        """Regions beyond the number of Gaussians, which are merged or stay black; 0 without guidance."""
+        if self.regions is None or not self.config.guidance:
+            return 0
+        return max(0, self.regions.num_regions - self.num_gaussians)
+
+    @property
     def chooses_softness(self) -> bool:
         """True where the softness of contours is to be chosen, and the map came without."""
         return self.config.softness == "auto" and self.regions is not None and self.regions.softness == 0.0
@@ -91,8 +97,8 @@ class Problem:
     @cached_property
     def objective(self) -> Objective:
         """What the descent lowers."""
-        if self.custom.objective is not None:
-            return LossObjective(self.custom.objective, self.image)
+        if self.objects.objective is not None:
+            return LossObjective(self.objects.objective, self.image)
         assert self.config.objective is not None
         kind = _OBJECTIVES[self.config.objective]
         return MsSsim(self.canvas, self.reduction) if kind is MsSsim else kind(self.canvas)
@@ -104,17 +110,17 @@ def make_problem(
     num_gaussians: object,
     config: FitConfig,
     seed: object,
-    custom: Custom = NONE,
+    objects: UserObjects = NO_OBJECTS,
     *,
     purpose: Purpose = "fit",
     size: tuple[int, int] | None = None,
     channels: int = 3,
 ) -> Problem:
     """Check the arguments of a fit for a purpose."""
-    if custom.objective is None:
+    if objects.objective is None:
         config = config.model_copy(update={"objective": objective_for(purpose, config.objective)})
     has_image = image is not None
-    if image is None and custom.objective is not None:
+    if image is None and objects.objective is not None:
         if size is None:
             raise InvalidArgument("size", "(height, width) without an image", None)
         if config.target_psnr is not None:
@@ -132,35 +138,4 @@ def make_problem(
     else:
         canvas, region_map = check_image_and_regions(image, regions)
     count = check_num_gaussians(num_gaussians, canvas)
-    return Problem(canvas, region_map, count, config, check_count("seed", seed, 0, 2**63 - 1), custom, has_image)
-
-
-def check_image_and_regions(image: Any, regions: object) -> tuple[Tensor, RegionMap | None]:
-    """Return a copy of the image, (C, H, W), that may take part in a graph, and its regions, on its device."""
-    image = as_image("image", image)
-    regions = regions_of(image.shape[1:], regions)
-    if regions is not None:
-        regions = regions.to(image.device)
-    dtype = torch.float64 if image.dtype == torch.float64 else torch.float32
-    return image.detach().to(dtype, copy=True, memory_format=torch.contiguous_format), regions
-
-
-def regions_of(size: tuple[int, ...], regions: object) -> RegionMap | None:
-    """Return a label map as one map of a size."""
-    regions = as_region_map(regions)
-    if regions is None:
-        return None
-    if regions.num_maps == 1:
-        regions = regions[0]
-    if regions.size != tuple(size) or regions.num_maps is not None:
-        raise InvalidArgument("regions", f"one map of the image's size {tuple(size)}", tuple(regions.labels.shape))
-    return regions
-
-
-def check_num_gaussians(value: object, image: Tensor) -> int:
-    """Return N if it is a number of Gaussians that an image (C, H, W) can use."""
-    count, pixels = check_count("num_gaussians", value), image.shape[1] * image.shape[2]
-    if count > pixels:
-        size = f"{image.shape[2]} x {image.shape[1]}"
-        raise InvalidArgument("num_gaussians", f"at most {pixels}, the pixels of the {size} image", count)
-    return count
+    return Problem(canvas, region_map, count, config, check_count("seed", seed, 0, 2**63 - 1), objects, has_image)

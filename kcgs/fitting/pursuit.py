@@ -13,12 +13,12 @@ from torch.nn.functional import max_pool2d, pad
 
 from kcgs._check import check_count, check_floating
 from kcgs.errors import InvalidArgument
-from kcgs.functional import RegionMap, lookup_regions, region_splat
+from kcgs.functional import RegionMap, halve, lookup_regions, region_splat
 from kcgs.kernels import check_backend, takes_triton
 from kcgs.nn import GaussianField
-from kcgs.optim import Objective, Renderer, halve
+from kcgs.optim import Objective, Renderer
 
-from .problem import regions_of
+from .checks import regions_of
 from .state import FitState
 
 # Standard deviations that are tried, in pixels, by the side of the blocks that the residual is averaged over for them.

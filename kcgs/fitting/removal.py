@@ -14,7 +14,7 @@ from kcgs.kernels import check_backend
 from kcgs.nn import GaussianField
 from kcgs.optim import Gaussians, Renderer, draft_cutoff
 
-from .problem import regions_of
+from .checks import regions_of
 from .state import FitState
 
 

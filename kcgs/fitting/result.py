@@ -48,7 +48,7 @@ class FitResult(NamedTuple):
     regions: RegionReport | None = None
     """What became of the label map; None without one."""
     seconds: float = 0.0
-    """Wall time of the whole call; the history of a search is that of one fit."""
+    """Wall time from the start to the pruned scene, without compilation; a search counts all its fits."""
 
     def __repr__(self) -> str:
         psnr = max((entry.psnr for entry in self.history), default=math.nan)

@@ -15,7 +15,7 @@ _DENSIFIERS = {"matching-pursuit": Densify, "largest-error": DensifyAtLargestErr
 def make_schedule(problem: Problem) -> list[Event]:
     """Return the events, in the order in which they act."""
     config, contours = problem.config, AdaptContours() if problem.config.move_contours else None
-    densify = problem.custom.densify or _DENSIFIERS[config.densify](contours)
+    densify = problem.objects.densify or _DENSIFIERS[config.densify](contours)
     events: list[Event] = [EndDrafts()]
     if config.warmup:
         events.append(Warmup())

@@ -75,17 +75,21 @@ def _fit(problem: Problem, count: int, trials: list[_Trial], seconds: float, run
     changes = {
         "target_psnr": None,
         "max_seconds": None if math.isinf(seconds) else max(seconds, 1e-3),
-        "iterations": config.num_iterations,
+        "iterations": config.planned_iterations,
     }
     settings = config.model_copy(update=changes)
     nearest = min(trials, key=lambda t: abs(math.log(t.num_gaussians / count)), default=None)
     problem = replace(problem, num_gaussians=count, config=settings)
-    if nearest is None or nearest.result.stop_reason == "diverged" or not optimizer_kind(problem).keeps_averages:
-        state = start(problem)
-    else:
-        state = _warm_start(problem, nearest.state)
+    goes_on = nearest is not None and _can_go_on(problem, nearest)
+    state = _warm_start(problem, nearest.state) if nearest is not None and goes_on else start(problem)
     result = run(state)
     return _Trial(count, float(psnr(result.scene.render().to(problem.canvas), problem.canvas)), result, state)
+
+
+def _can_go_on(problem: Problem, trial: _Trial) -> bool:
+    """Whether a fit may go on from a trial, whose regions are merged for its own number of Gaussians."""
+    is_merged = problem.config.merge_regions and problem.num_excess_regions != trial.state.problem.num_excess_regions
+    return trial.result.stop_reason != "diverged" and optimizer_kind(problem).keeps_averages and not is_merged
 
 
 def _warm_start(problem: Problem, finished: FitState) -> FitState:
@@ -93,7 +97,7 @@ def _warm_start(problem: Problem, finished: FitState) -> FitState:
     count, field = problem.num_gaussians, copy.deepcopy(finished.field)
     state = make_state(
         problem, field, finished.regions, count, anchor=finished.anchor, num_additions=finished.num_additions,
-        iteration=round(_WARM_START * problem.config.num_iterations),
+        iteration=round(_WARM_START * problem.config.planned_iterations),
     )  # fmt: skip
     state.optimizer.load_state_dict(copy.deepcopy(finished.optimizer.state_dict()))
     remove_gaussians(state, state.num_gaussians - count)

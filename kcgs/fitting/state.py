@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap
 from kcgs.optim import FieldState, is_within
 from kcgs.scene import Scene
@@ -31,14 +32,14 @@ class FitState(FieldState):
     num_additions: int = 0
     """How often Gaussians were added."""
     num_cycles: int = 0
-    """Cycles of removals and additions after their number has grown; 0: it grows."""
+    """Cycles of removals and additions; 0 while the number of Gaussians still grows."""
     num_late_moves: int = 0
     """How often contours moved after densification."""
     history: list[HistoryEntry] = field(default_factory=list)
     best: Scene | None = None
     """A copy of the best scene that was measured."""
     best_is_draft: bool = True
-    """The best was rendered with the cutoff of a draft, so every other scene is better."""
+    """The best was rendered with the cutoff of a draft, and any scene that is none beats it."""
     best_value: float = math.inf
     """Squared error of the best, or value of the objective; see `Objective.is_ranked_by_psnr`."""
 
@@ -67,7 +68,7 @@ class FitState(FieldState):
         """About how many iterations the fit will take."""
         config = self.problem.config
         if config.max_seconds is None:
-            return config.num_iterations
+            return config.planned_iterations
         return self.iteration / max(self.progress, 1e-9)
 
     def end_drafts(self) -> None:
@@ -96,6 +97,8 @@ def record(state: FitState, measurement: Measurement, errors: Errors) -> None:
     """Put a measurement into the history, and keep its scene if it is the best; one of NaN does not count."""
     iteration, seconds, scene, is_draft = measurement
     if math.isnan(errors.objective):
+        if not state.history:
+            raise InvalidArgument("objective", "a number at the first Gaussians of a fit", "NaN")
         return
     psnr, ef_psnr = _decibel(errors.squared), _decibel(errors.squared_near_contours)
     state.history.append(HistoryEntry(iteration, seconds, errors.objective, psnr, ef_psnr, scene.num_gaussians))

@@ -3,7 +3,7 @@
 from kcgs.maps import PairSoftness, RegionMap, edge_band, lookup_regions
 
 from .activation import activate_gaussians
-from .blur import blur, gaussian_taps
+from .blur import blur, gaussian_taps, halve
 from .contour_fit import choose_softness
 from .covariance import (
     check_cholesky,

@@ -3,9 +3,10 @@
 from .descent import FieldState, move_field, set_rates, step_field
 from .gaussian_adam import COLOR_LEARNING_RATE, LEARNING_RATE, GaussianAdam, is_within
 from .gaussians import Gaussians, Renderer, draft_cutoff
-from .ms_ssim import OBJECTIVES, MsSsim, halve
+from .ms_ssim import MsSsim
 from .newton import NewtonDescent, self_product
 from .objectives import AbsoluteError, ImageObjective, Loss, LossObjective, Objective, SquaredError
+from .registry import OBJECTIVES
 from .run import End, Event, TimedAction, cosine_decay, count_iterations, run
 
 # public; what else is imported here is for the other rooms of kcgs

@@ -379,7 +379,7 @@ def _bounded(means: Tensor, cholesky: Tensor, size: tuple[int, int], min_sigma: 
     l11, l21, l22 = cholesky.unbind(-1)
     l11, l22 = l11.clamp(_MIN_FACTOR, diagonal), l22.clamp(_MIN_FACTOR, diagonal)
     l21 = l21.clamp(-diagonal, diagonal)
-    # no tensor of the size: it would be copied to a device, and waited for
+    # no tensor of the size: its copy to a device would force a host sync
     reaches, lengths = (_MAX_OUTSIDE * l11, _MAX_OUTSIDE * torch.hypot(l21, l22)), (width, height)
     places = [
         torch.minimum(torch.maximum(place, -reach), reach + length)

@@ -71,7 +71,7 @@ class Renderer(NamedTuple):
 
     def inner_products(self, gaussians: Gaussians) -> Tensor:
         """Sum the render over the weights of each Gaussian, (N, C), in one pass where the backend has it."""
-        # the render, less nothing, is what the squared error of a black image is differentiated by
+        # against a black image, half the gradient by a colour is the inner product
         black = gaussians.colors.new_zeros(gaussians.colors.shape[1], *self.size)
         return self.squared_error_gradients(gaussians, black).colors
 

@@ -37,9 +37,10 @@ class Objective(ABC):
 
     @abstractmethod
     def slope(self, render: Tensor) -> Tensor:
-        """Return half the gradient at a render, (C, H, W), whose memory this method may overwrite.
+        """Return the gradient at a render, (C, H, W), whose memory this method may overwrite, times a positive factor.
 
-        Adam ignores a constant factor. Newton's method takes half of the squared error's.
+        The gradient is that of the value times the number of values. The factor is one half for the objectives of
+        Newton's method, the squared error and MS-SSIM; Adam ignores it.
         """
 
     @abstractmethod

@@ -269,7 +269,7 @@ def _choose_regions(problem: Problem, target_bytes: int) -> _RegionChoice:
     if _reduction(_min_sigma(problem, choice.num_gaussians)) > 1:
         return choice._replace(changes={"dropped": "bytes"})
     # by iterations, so that without a clock the same arguments give the same file
-    iterations = min(_SETTINGS.trial_iterations, config.num_iterations)
+    iterations = min(_SETTINGS.trial_iterations, config.planned_iterations)
     trial_config = FitConfig.from_recipe(
         config, merge_regions=False, iterations=iterations, max_seconds=None, objective="l2"
     )
@@ -312,5 +312,5 @@ def _fit_share(
 ) -> FitResult:
     """Run the first share of a fit's schedule; all of it where a clock ends the fit."""
     config = problem.config
-    until = 1.0 if config.max_seconds else math.ceil(share * config.num_iterations) / config.num_iterations
+    until = 1.0 if config.max_seconds else math.ceil(share * config.planned_iterations) / config.planned_iterations
     return fit_problem(problem, on_step, progress, until=until)

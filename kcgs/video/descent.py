@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from kcgs.fitting import FitConfig, lowest_weighted_impact, move_contours, propose_for
-from kcgs.functional import RegionMap
 from kcgs.optim import (
     OBJECTIVES,
     End,
@@ -145,9 +144,5 @@ class FrameDescent(NewtonDescent):
 
     def _move_contours(self, anchor: Tensor) -> None:
         """Move contours to where the error is lower, or little higher."""
-
-        def squared_error(regions: RegionMap) -> Tensor:
-            return self.renderer._replace(regions=regions).squared_error(self.gaussians, self.image)
-
-        regions = move_contours(self.scene, self.image, anchor, self.config, squared_error, _MAX_RISE)
+        regions = move_contours(self.gaussians, self.renderer, self.image, anchor, self.config, _MAX_RISE)
         self.renderer = self.renderer._replace(regions=regions)

@@ -87,6 +87,10 @@ class TestLoss:
             ),
             ({"objective": 3}, "objective must be a name or a function; got 3"),
             ({"densify": OldEvent()}, "densify must be an event without `due`, whose `act` knows when it acts; got "),
+            (
+                {"objective": lambda render: render.mean() * math.nan},
+                "objective must be a number at the first Gaussians",
+            ),
             ({"densify": 3}, "densify must be a name, or an event with `act` and `end`; got 3"),
         ],
     )

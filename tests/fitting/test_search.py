@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import pytest
@@ -62,6 +63,17 @@ class TestFewest:
     def test_same_result_again(self, photo: tuple[Tensor, Tensor]) -> None:
         first, second = (fit(*photo, 200, recipe=quick(target_psnr=20.0)) for _ in range(2))
         assert torch.equal(first.scene.render(), second.scene.render())
+
+    def test_regions_are_merged_for_the_number_of_gaussians(self, photo: tuple[Tensor, Tensor]) -> None:
+        """Not for that of a trial before: with fewer none stays black, with more none is merged."""
+        image, (y, x) = photo[0], torch.meshgrid(torch.arange(32), torch.arange(48), indexing="ij")
+        labels = y // 8 * 6 + x // 8  # 24 regions
+        for target in (13.0, 21.0):
+            with warnings.catch_warnings(action="ignore"):  # of merged regions
+                result = fit(image, labels, 300, recipe=quick(target_psnr=target, prune=0.0))
+            count, regions = result.scene.num_gaussians, result.scene.regions
+            assert result.stop_reason == "target_psnr" and result.regions is not None and result.regions.empty == 0
+            assert (1 if regions is None else regions.num_regions) >= min(count, 24) - 2
 
     def test_published_recipes_too(self, photo: tuple[Tensor, Tensor]) -> None:
         result = fit(*photo, 400, recipe="gaussian-image", iterations=40, target_psnr=14.0)

@@ -73,7 +73,7 @@ class TestMsSsim:
         y, x = torch.meshgrid(torch.arange(192.0) + 0.5, torch.arange(208.0) + 0.5, indexing="ij")
         for weight, sigma in zip(objective.weigh(Gaussians(means, cholesky, means)), sigmas, strict=True):
             g = 1e-4 * torch.exp(-0.5 * ((x - 60.5) ** 2 + (y - 90.5) ** 2) / sigma**2).expand(3, -1, -1).double()
-            assert float(weight) == pytest.approx(float(objective.value(image + g) / g.square().mean()), rel=0.5)
+            assert float(weight) == pytest.approx(float(objective.value(image + g) / g.square().mean()), rel=0.35)
 
     @pytest.mark.parametrize("size", [(1, 1), (1, 9), (21, 30), (22, 30), (50, 47), (283, 39)])
     def test_compiled(self, size: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:

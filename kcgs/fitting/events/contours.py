@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
 from kcgs.fitting.contour_moves import move_contours
 from kcgs.fitting.state import FitState
@@ -41,15 +40,10 @@ class AdaptContours:
 
 def _move_contours(state: FitState, max_rise: float) -> None:
     """Move the contours where that raises the squared error about them by no more than a factor."""
-    gaussians, renderer, image = state.gaussians, state.renderer, state.problem.image
+    image, config = state.problem.image, state.problem.config
     if state.regions is None or state.anchor is None or image is None:
         return
-
-    def squared_error(regions: RegionMap) -> Tensor:
-        return renderer._replace(regions=regions).squared_error(gaussians, image)
-
-    config, anchor = state.problem.config, state.anchor.labels
-    state.regions = move_contours(state.scene, image, anchor, config, squared_error, max_rise)
+    state.regions = move_contours(state.gaussians, state.renderer, image, state.anchor.labels, config, max_rise)
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ class Log:
         """Measure, if it is time to."""
         config = state.problem.config
         if config.max_seconds is None:
-            if state.iteration % max(1, config.num_iterations // _HISTORY_LENGTH):
+            if state.iteration % max(1, config.planned_iterations // _HISTORY_LENGTH):
                 return
         elif state.progress < self._next:
             return

@@ -10,7 +10,7 @@ from torch import Tensor
 from kcgs.nn import GaussianField
 
 from .adan import Adan
-from .optimizer import MIN_SIGMA, PublishedOptimizer
+from .reparametrized import MIN_SIGMA, PublishedOptimizer
 
 # tanh reaches it
 _EDGE = 1.0 - 1e-6

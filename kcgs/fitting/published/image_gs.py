@@ -7,7 +7,7 @@ from torch import Tensor
 
 from kcgs.nn import GaussianField
 
-from .optimizer import MIN_SIGMA, PublishedOptimizer
+from .reparametrized import MIN_SIGMA, PublishedOptimizer
 
 
 class ImageGSAdam(PublishedOptimizer):

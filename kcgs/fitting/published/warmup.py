@@ -21,7 +21,7 @@ class Warmup:
 
     def act(self, state: FitState) -> None:
         """Read the ids, but leave no region without its last Gaussian: nothing else would feel the error there."""
-        field, regions, iterations = state.field, state.regions, state.problem.config.num_iterations
+        field, regions, iterations = state.field, state.regions, state.problem.config.planned_iterations
         is_turn = state.iteration % max(1, round(self.every * iterations)) == 0
         if regions is None or not is_turn or not 0 < state.iteration <= self.until * iterations:
             return

@@ -12,14 +12,32 @@ from kcgs.optim import Event, Loss
 
 @runtime_checkable
 class Densifier(Event, Protocol):
-    """An event that adds Gaussians to a fit."""
+    """An event that adds Gaussians to a fit: the argument `densify` of :func:`kcgs.fit`.
+
+    ``act(state)`` is called before every step with the :class:`FitState`. It returns at once, unless it is time by
+    ``state.progress``. A reason, a string, ends the fit.
+
+    Example:
+        >>> import torch
+        >>> from kcgs.fitting import fit, propose_gaussians
+        >>> class AddOnce:
+        ...     end = 0.3
+        ...     def act(self, state):
+        ...         if state.num_additions == 0 and state.progress >= self.end:
+        ...             state.num_additions += 1
+        ...             error = state.problem.image - state.render().detach()
+        ...             state.optimizer.append(state.field, propose_gaussians(error, 10, state.regions))
+        >>> image = torch.linspace(0, 1, 48).expand(3, 32, 48)
+        >>> fit(image, num_gaussians=20, iterations=50, densify=AddOnce(), prune=0.0).scene.num_gaussians
+        11
+    """
 
     @property
     def end(self) -> float:
         """Share of the fit at its last addition; after it contours move a few times on their own."""
 
 
-class Custom(NamedTuple):
+class UserObjects(NamedTuple):
     """Arguments of a fit that no file keeps; None where the settings have a name."""
 
     objective: Loss | None = None
@@ -29,21 +47,21 @@ class Custom(NamedTuple):
     """Returns an optimizer with the methods of GaussianAdam."""
 
 
-NONE = Custom()
+NO_OBJECTS = UserObjects()
 
 
-def split_names(**arguments: object) -> tuple[dict[str, Any], Custom]:
+def split_names(**arguments: object) -> tuple[dict[str, Any], UserObjects]:
     """Split the arguments objective, densify and optimizer into settings, by name, and objects of the user's."""
     settings: dict[str, Any] = {name: value for name, value in arguments.items() if isinstance(value, str)}
-    custom = Custom(**{name: value for name, value in arguments.items() if name not in settings})  # type: ignore[arg-type]
-    for name, value in custom._asdict().items():
+    objects = UserObjects(**{name: value for name, value in arguments.items() if name not in settings})  # type: ignore[arg-type]
+    for name, value in objects._asdict().items():
         if name != "densify" and value is not None and not callable(value):
             raise InvalidArgument(name, "a name or a function", repr(value))
-    densify = custom.densify
+    densify = objects.densify
     if hasattr(densify, "due"):
         raise InvalidArgument("densify", "an event without `due`, whose `act` knows when it acts", repr(densify))
     if densify is not None and not isinstance(densify, Densifier):
         raise InvalidArgument("densify", "a name, or an event with `act` and `end`", repr(densify))
-    if custom.objective is not None:  # else the recipe's
+    if objects.objective is not None:  # else the recipe's
         settings["objective"] = None
-    return settings, custom
+    return settings, objects
