@@ -19,6 +19,9 @@ import kcgs
 from kcgs import FitConfig, GaussianField, RegionMap, RegionSplatRenderer, Scene, codec, fit, prune
 from kcgs.data import ChartSample, Davis, DavisFrame, save_image, save_labels
 from kcgs.fitting import FitResult, available_recipes
+from kcgs.fitting.events import Densify
+from kcgs.fitting.problem import make_problem
+from kcgs.fitting.start import start
 from kcgs.functional import PairSoftness
 from kcgs.rate import Compressed, FitBytesResult
 from kcgs.segment import Cleanup, Prediction, Segmentation
@@ -46,6 +49,7 @@ def objects(result: FitResult, folder: Path) -> Iterator[Any]:
     image, data = torch.rand(3, *SIZE), codec.encode(result.scene)
     yield from (result, result.history[0], result.regions, field, regions, regions.resize((128, 192)), scene)
     yield from (PairSoftness(WIDTHS), RegionSplatRenderer())
+    yield from (start(make_problem(image, LABELS, 400, FitConfig(), 0)), Densify())
     yield from (FitConfig.from_recipe(recipe) for recipe in available_recipes())
     yield from (codec.decode(data), Compressed(data, scene), FitBytesResult(data, scene, result), prune(result.scene))
     yield from (Segmentation(LABELS, torch.rand(21), {i: f"name {i}" for i in range(21)}), Cleanup())

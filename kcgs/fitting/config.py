@@ -18,7 +18,7 @@ from kcgs.maps import MAX_SOFTNESS
 
 _USUAL_ITERATIONS = 700
 # settings of version 0.3, and what to write now
-_RENAMED = {"loss": "objective has its values"}
+_RENAMED = {"loss": "it is objective now, with the same values"}
 
 
 class FitConfig(BaseModel):
@@ -110,6 +110,12 @@ class FitConfig(BaseModel):
         None, gt=0.0, description="the fewest Gaussians that reach this PSNR (dB), by a search over several fits"
     )
 
+    def __init__(self, **values: Any) -> None:
+        try:
+            super().__init__(**values)
+        except ValidationError as error:
+            raise _first(error) from None
+
     @field_validator("objective", mode="before")
     @classmethod
     def _check_objective(cls, value: object) -> ObjectiveName | None:
@@ -158,10 +164,7 @@ class FitConfig(BaseModel):
             raise InvalidArgument("recipe", f"one of {', '.join(available_recipes())}", repr(recipe))
         else:
             values = tomllib.loads((files("kcgs.recipes") / f"{recipe}.toml").read_text(encoding="utf-8"))
-        try:
-            return cls(**{**values, **settings})
-        except ValidationError as error:
-            raise _first(error) from None
+        return cls(**{**values, **settings})
 
 
 def available_recipes() -> list[str]:

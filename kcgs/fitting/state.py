@@ -18,7 +18,7 @@ from .result import HistoryEntry
 LARGEST = 1e15
 
 
-@dataclass(kw_only=True)
+@dataclass(kw_only=True, repr=False)
 class FitState(FieldState):
     """A fit in progress: the start fills it, events and steps change it, a checkpoint keeps it."""
 
@@ -42,6 +42,9 @@ class FitState(FieldState):
     """The best was rendered with the cutoff of a draft, and any scene that is none beats it."""
     best_value: float = math.inf
     """Squared error of the best, or value of the objective; see `Objective.is_ranked_by_psnr`."""
+
+    def __repr__(self) -> str:
+        return f"FitState(iteration {self.iteration}, progress {self.progress:.2f}, {self.scene!r})"
 
     @property
     def scene(self) -> Scene:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import tomllib
+from functools import partial
 from itertools import pairwise
 
 import pytest
@@ -302,15 +303,16 @@ class TestErrors:
             ({"objective": "psnr"}, "^objective must be one of l2, .*; got 'psnr', which is now 'l2'$"),
             ({"objective": "auto"}, "^objective must be .*; got 'auto', which is now the default: leave it out$"),
             ({"objective": abs}, "^objective must be .*; got a function, which only kcgs.fit takes$"),
-            ({"loss": "l1"}, "^unknown setting 'loss': objective has its values$"),
+            ({"loss": "l1"}, "^unknown setting 'loss': it is objective now, with the same values$"),
             ({"densify": object()}, "^densify must be 'matching-pursuit' or 'largest-error'; got "),
             ({"max_seconds": math.inf}, "max_seconds must be a finite number"),
             ({"backend": "gpu"}, "^backend must be one of auto, [^;]*; got 'gpu'$"),
         ],
     )
     def test_bad_settings(self, settings: dict[str, object], words: str) -> None:
-        with pytest.raises(ValueError, match=words):
-            FitConfig.from_recipe("paper", **settings)
+        for make in (FitConfig, partial(FitConfig.from_recipe, "paper")):
+            with pytest.raises(ValueError, match=words):
+                make(**settings)
 
 
 class TestThreads:
