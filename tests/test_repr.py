@@ -82,7 +82,7 @@ def test_every_public_class(result: FitResult, tmp_path: Path) -> None:
 def test_values_in_a_repr(result: FitResult) -> None:
     count = result.scene.num_gaussians
     assert repr(result.scene) == f"Scene({count} Gaussians, 3 channels, size=(64, 96), confined, 2 regions)"
-    start = f"FitResult({max(e.psnr for e in result.history):.2f} dB, stopped by iterations, "
+    start = f"FitResult({result.psnr:.2f} dB, stopped by iterations, "
     assert repr(result).startswith(start) and repr(result).endswith(f" s, {result.scene!r})")
     assert repr(result.scene.regions).startswith("RegionMap(2 regions, size=(64, 96), softness=")
     assert repr(Segmentation(LABELS)) == "Segmentation(labels=int64 (64, 96), scores=None, names=None)"

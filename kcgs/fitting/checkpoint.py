@@ -24,7 +24,7 @@ from .state import FitState
 
 # a checkpoint is written when the fit has run this many times as long as the last one took to write
 _RUN_PER_WRITE = 100.0
-_VERSION = 9
+_VERSION = 10
 _DIGEST_SIZE = 32  # bytes of the SHA-256 of the content, which begins the file
 
 

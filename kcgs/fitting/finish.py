@@ -11,11 +11,11 @@ from .clock import Clock
 from .measurement import measure_errors, snapshot
 from .region_report import report_regions
 from .removal import remove_gaussians
-from .result import FitResult, StopReason
+from .result import FitResult
 from .state import Errors, FitState, Measurement, record
 
 
-def finish(state: FitState, reason: StopReason, clock: Clock) -> FitResult:
+def finish(state: FitState, reason: str, clock: Clock) -> FitResult:
     """Measure the last scene, take the best, and prune it; return a fit that ended for a reason."""
     problem, config, best_draft, seconds = state.problem, state.problem.config, state.best, clock.seconds()
     with torch.no_grad():
@@ -36,4 +36,6 @@ def finish(state: FitState, reason: StopReason, clock: Clock) -> FitResult:
     if config.prune > 0:
         scene, num_pruned, prune_error = prune(scene, config.prune, cutoff=config.cutoff, backend=config.backend)
     report = report_regions(problem.regions, scene, dropped=None if config.guidance else "recipe")
-    return FitResult(scene, state.history, reason, config, num_pruned, prune_error, report, clock.seconds())
+    return FitResult(
+        scene, state.history, reason, config, num_pruned, prune_error, report, clock.seconds(), state.best_psnr
+    )

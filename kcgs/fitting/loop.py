@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Callable
 from functools import lru_cache, partial
-from typing import Any, cast
+from typing import Any
 
 import torch
 
@@ -25,7 +25,7 @@ from .events import Log, OnStep, Report, StopAtDivergence
 from .finish import finish
 from .optimizers import optimizer_kind
 from .problem import Problem, make_problem
-from .result import FitResult, StopReason
+from .result import FitResult
 from .schedule import make_schedule
 from .search import search
 from .start import start
@@ -188,7 +188,7 @@ def _run(
     events: list[Event] = [report, end, StopAtDivergence(stepper), *schedule, log]
     reason = run(state, stepper.step, progress, events, optimizer_kind(state.problem).rate)
     stepper.poll(wait=True)
-    return finish(state, cast(StopReason, reason), clock)
+    return finish(state, reason, clock)
 
 
 def _warn_of_regions(problem: Problem) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from kcgs.plots import history_figure
 from kcgs.scene import Scene
@@ -13,8 +13,6 @@ from .region_report import RegionReport
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-StopReason = Literal["iterations", "seconds", "target_psnr", "callback", "diverged"]
 
 
 class HistoryEntry(NamedTuple):
@@ -39,7 +37,8 @@ class FitResult(NamedTuple):
     """Without regions where nothing is confined."""
     history: list[HistoryEntry]
     """Its EF-PSNR is along the contours of the user's map, not of the scene's; see :class:`HistoryEntry`."""
-    stop_reason: StopReason
+    stop_reason: str
+    """iterations, seconds, target_psnr, callback or diverged; or what an event of yours returned."""
     config: FitConfig
     num_pruned: int = 0
     """Gaussians that were removed at the end since they changed the render by next to nothing."""
@@ -49,10 +48,11 @@ class FitResult(NamedTuple):
     """What became of the label map; None without one."""
     seconds: float = 0.0
     """Wall time from the start to the pruned scene, without compilation; a search counts all its fits."""
+    psnr: float = math.nan
+    """Of the scene before pruning, in dB; NaN without an image."""
 
     def __repr__(self) -> str:
-        psnr = max((entry.psnr for entry in self.history), default=math.nan)
-        return f"FitResult({psnr:.2f} dB, stopped by {self.stop_reason}, {self.seconds:.1f} s, {self.scene!r})"
+        return f"FitResult({self.psnr:.2f} dB, stopped by {self.stop_reason}, {self.seconds:.1f} s, {self.scene!r})"
 
     def _repr_png_(self) -> bytes | None:
         return self.scene._repr_png_()

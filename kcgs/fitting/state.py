@@ -42,6 +42,8 @@ class FitState(FieldState):
     """The best was rendered with the cutoff of a draft, and any scene that is none beats it."""
     best_value: float = math.inf
     """Squared error of the best, or value of the objective; see `Objective.is_ranked_by_psnr`."""
+    best_psnr: float = math.nan
+    """Of the best, in dB."""
 
     def __repr__(self) -> str:
         return f"FitState(iteration {self.iteration}, progress {self.progress:.2f}, {self.scene!r})"
@@ -107,7 +109,7 @@ def record(state: FitState, measurement: Measurement, errors: Errors) -> None:
     state.history.append(HistoryEntry(iteration, seconds, errors.objective, psnr, ef_psnr, scene.num_gaussians))
     value = errors.squared if state.objective.is_ranked_by_psnr else errors.objective
     if (is_draft, value) < (state.best_is_draft, state.best_value):
-        state.best, state.best_is_draft, state.best_value = scene, is_draft, value
+        state.best, state.best_is_draft, state.best_value, state.best_psnr = scene, is_draft, value, psnr
 
 
 def _decibel(mean_square: float) -> float:

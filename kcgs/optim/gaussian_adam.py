@@ -220,14 +220,16 @@ def _layout(field: GaussianField) -> str:
 
 def _step_colors(state: dict[str, Tensor], group: dict[str, Any], finite: Tensor | None) -> None:
     colors, *opacities = group["params"]
-    tables = [colors, *(alpha[..., None] for alpha in opacities)]
+    # the steps of a frozen table go into a copy of it
+    tables = [table if table.requires_grad else table.clone() for table in (colors, *opacities)]
+    tables = [tables[0], *(alpha[..., None] for alpha in tables[1:])]
     gradients = [_gradient(colors), *(_gradient(alpha)[..., None] for alpha in opacities)]
     gradient = torch.cat(gradients, -1) if opacities else gradients[0]
     if _is_compiled(*tables, *state.values()):
         from . import loops  # loads numba
 
         loops.step_tables(tuple(_rows(*tables)), *_rows(gradient), Adam(*_settings(group), *_averages(state)))
-        increment_version(group["params"])
+        increment_version([parameter for parameter in group["params"] if parameter.requires_grad])
         return
     change = _adam(state, gradient, group, finite)
     for table, part in zip(tables, change.split([table.shape[-1] for table in tables], -1), strict=True):

@@ -16,7 +16,10 @@ from kcgs import FitConfig, GaussianField, RegionMap, fit
 from kcgs.data import chart_2x3, chart_pie
 from kcgs.fitting import available_recipes
 from kcgs.fitting.problem import make_problem
+from kcgs.fitting.published.gaussian_image import GaussianImageAdan
 from kcgs.fitting.published.image_gs import ImageGSAdam
+from kcgs.fitting.published.warmup import Warmup
+from kcgs.fitting.start import start
 from kcgs.functional import ef_psnr, psnr
 from tests.conftest import Clock
 
@@ -215,6 +218,32 @@ class TestSwitches:
     def test_one_region_is_no_region(self) -> None:
         image, labels = disc()
         assert fit(image, torch.zeros_like(labels), 5, recipe=quick()).scene.regions is None
+
+    def test_the_psnr_is_that_of_the_scene(self) -> None:
+        image, labels = disc()
+        for settings in ({"objective": "ms-ssim"}, {"recipe": "best"}, {"recipe": "best", "objective": "l1"}):
+            result = fit(image, labels, 12, iterations=60, prune=0.0, **settings)
+            assert float(psnr(result.scene.render(), image)) == pytest.approx(result.psnr, abs=1e-3)
+
+    def test_warmup_leaves_no_region_without_its_last_gaussian(self) -> None:
+        image, labels = disc()
+        state = start(make_problem(image, labels, 2, quick(), 0))
+        first = state.field.region_ids.clone()
+        assert sorted(first.tolist()) == [0, 1]
+        state.field.means.data[:] = torch.tensor([20.0, 16.0])  # all are under label 1
+        state.iteration = 1
+        Warmup().act(state)
+        assert sorted(state.field.region_ids.tolist()) == [0, 1]
+
+    def test_the_map_of_tanh_and_signs_of_gaussian_image(self) -> None:
+        """A factor whose column has changed its sign is the same Gaussian."""
+        field = GaussianField.random(9, (20, 30), seed=0)
+        optimizer = GaussianImageAdan(field, 2.0, 100, 1.0)
+        expected = [tensor.detach().clone() for tensor in (field.means, field.cholesky, field.colors)]
+        with torch.no_grad():
+            optimizer.parameters[1][:, :2] *= -1
+        means, cholesky, colors = optimizer.decode()
+        torch.testing.assert_close([means, cholesky, colors], expected)
 
 
 class TestStopping:

@@ -142,6 +142,18 @@ def test_an_event_and_an_optimizer_of_ones_own(tmp_path: Path) -> None:
         fit(image(), LABELS, 60, checkpoint=tmp_path / "state", **settings)
 
 
+def test_an_event_that_adds_too_many_and_one_that_ends_the_fit() -> None:
+    class AddTooMany(AddAll):
+        def act(self, state: FitState) -> str | None:
+            if state.num_additions == 0:
+                state.num_additions, error = 1, image() - state.render().detach()
+                state.optimizer.append(state.field, propose_gaussians(error, 30, state.regions))
+            return "enough" if state.iteration == 9 else None
+
+    result = fit(image(), LABELS, 8, iterations=30, on_step=lambda i, e: False, densify=AddTooMany())
+    assert result.stop_reason == "enough" and 0 < result.scene.num_gaussians <= 8
+
+
 class TestLoop:
     """The two steps of a loop of one's own."""
 

@@ -220,6 +220,19 @@ class TestProtocol:
         descend(field, GaussianAdam(field, min_sigma=8.0), 3)
         assert torch.equal(frozen, before)
 
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    def test_a_colour_that_is_frozen_later_stays(self, dtype: torch.dtype) -> None:
+        """The averages of its steps, and a gradient from before, move only what trains."""
+        field = GaussianField.random(20, SIZE, seed=0, dtype=dtype)
+        field.opacities = torch.nn.Parameter(torch.full((20,), 0.5, dtype=dtype))
+        optimizer = GaussianAdam(field)
+        descend(field, optimizer, 3)
+        field.colors.requires_grad_(False)
+        colors, opacities = field.colors.clone(), field.opacities.detach().clone()
+        for _ in range(3):
+            optimizer.step()
+        assert torch.equal(field.colors, colors) and not torch.equal(field.opacities, opacities)
+
     def test_another_field(self) -> None:
         optimizer, other = GaussianAdam(field_of()), field_of()
         for change in (lambda: optimizer.append(other, other), lambda: optimizer.keep(other, torch.ones(20) > 0)):

@@ -6,12 +6,12 @@ from kcgs.fitting.clock import Clock
 from kcgs.fitting.state import FitState
 from kcgs.fitting.steppers import Stepper
 
-# about how many entries a history has
+# least number of entries of a history, if there are as many iterations
 _HISTORY_LENGTH = 100
 
 
 class Log:
-    """Measures the scene about a hundred times per fit, when there are no more than N Gaussians."""
+    """Measures the scene 100 to 200 times per fit, when there are no more than N Gaussians."""
 
     def __init__(self, stepper: Stepper, clock: Clock) -> None:
         self._stepper, self._clock = stepper, clock

@@ -15,7 +15,7 @@ OnStep = Callable[[int, HistoryEntry], bool | None]
 
 
 class Report:
-    """Reports every step, from the second iteration on; ends the fit where the callback returns True.
+    """Reports every step once a scene was measured; ends the fit where the callback returns True.
 
     Args:
         stepper: of the fit.
@@ -38,6 +38,8 @@ class Report:
             self._has_stepped = True
             return None
         self._stepper.poll()
+        if not state.history:  # an event may add more than N Gaussians at once, which are not measured
+            return None
         entry = state.history[-1]
         self._bar.update(
             state.progress, f"iteration {state.iteration}, {entry.num_gaussians} Gaussians, {entry.psnr:.2f} dB"
