@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from kcgs.maps import MapOperands
+from kcgs.maps import MapTable
 
-# operands where one region covers everything
-NO_MAP = (None,) * (len(MapOperands._fields) - 1)
+_NUM_GAUSSIANS = 4  # arguments before the table
+_END = _NUM_GAUSSIANS + len(MapTable._fields)
+# of the operator, which takes the fields of a table one by one, as all operators of torch do
+SCHEMA = (
+    "Tensor means, Tensor cholesky, Tensor colors, Tensor? region_ids, "
+    + ", ".join(f"Tensor? {name}" for name in MapTable._fields)
+    + ", SymInt height, SymInt width, float cutoff, str backend"
+)
+NUM_ARGUMENTS = _END + 4
 
 
 class SplatArguments(NamedTuple):
-    """The arguments of the operator, in order; floating tensors share one dtype, float32 or float64.
+    """The arguments of the operator; floating tensors share one dtype, float32 or float64.
 
     For one image B may be left out of means, cholesky, colors and region_ids together, and so of the image.
     """
@@ -22,25 +29,25 @@ class SplatArguments(NamedTuple):
     cholesky: Tensor  # [B, N, 3]
     colors: Tensor  # [B, N, C]
     region_ids: Tensor | None  # [B, N] int64
-    labels: Tensor | None  # [H, W] or [B, H, W] int64, of the map at its own size
-    blurs: Tensor | None  # this and the next six: see `MapOperands`
-    width_index: Tensor | None
-    ids: Tensor | None
-    starts: Tensor | None
-    regions: Tensor | None
-    planes: Tensor | None
-    weights: Tensor | None
-    height: int
-    width: int
+    table: MapTable | None  # of the map at its own size; None: one region covers everything
+    size: tuple[int, int]  # (height, width) of the image
     cutoff: float
     backend: str
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """(height, width) of the image."""
-        return self.height, self.width
+    @classmethod
+    def of(cls, *values: Any) -> SplatArguments:
+        """Take the arguments in the order of the schema."""
+        table = None if values[_NUM_GAUSSIANS] is None else MapTable(*values[_NUM_GAUSSIANS:_END])
+        means, cholesky, colors, region_ids = values[:_NUM_GAUSSIANS]
+        height, width, cutoff, backend = values[_END:]
+        return cls(means, cholesky, colors, region_ids, table, (height, width), cutoff, backend)
 
-    @property
-    def map_operands(self) -> MapOperands | None:
-        """The map at the size of the image; None: one region covers everything."""
-        return None if self.labels is None else MapOperands(self.labels, *self[5:12], self.size)
+    def flatten(self) -> tuple[Any, ...]:
+        """Return the arguments in the order of the schema."""
+        table = [None] * len(MapTable._fields) if self.table is None else self.table
+        return (*self[:_NUM_GAUSSIANS], *table, *self.size, self.cutoff, self.backend)
+
+
+def place_of(name: str) -> int:
+    """Return the place of a field of the table among the arguments."""
+    return _NUM_GAUSSIANS + MapTable._fields.index(name)

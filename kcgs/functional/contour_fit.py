@@ -17,7 +17,7 @@ from torch import Tensor
 
 from kcgs._check import check_floating, check_number
 from kcgs._labels import check_labels
-from kcgs.maps import MAX_SOFTNESS, RADIUS_SIGMAS, contour_edges, unique_pairs
+from kcgs.maps import MAX_SOFTNESS, RADIUS_SIGMAS, contour_edges, truncated_gaussian, unique_pairs
 
 CANDIDATES = (0.0, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)  # pixels: from hard to out of focus, by factors of about sqrt(2)
 _STEP = 0.05  # pixels that a softness between two candidates is rounded to
@@ -232,10 +232,7 @@ def _spread(group: Tensor, most: int) -> Tensor:
 def _blur_matrix(softness: float, side: int, halo: int) -> Tensor:
     """Return the blur from `side + 2 halo` samples to the inner `side`."""
     distance = (torch.arange(side)[:, None] + halo - torch.arange(side + 2 * halo)).abs().float()
-    if softness == 0.0:
-        return (distance == 0).float()
-    reach = math.ceil(RADIUS_SIGMAS * softness)
-    return torch.where(distance <= reach, torch.exp(-0.5 * (distance / softness) ** 2), 0.0)
+    return truncated_gaussian(distance, softness)
 
 
 def _window_errors(pixels: Tensor, ids: Tensor, pairs: Tensor, kernels: list[Tensor]) -> _Errors:

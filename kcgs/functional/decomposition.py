@@ -34,7 +34,7 @@ class _TileGaussians(NamedTuple):
 
 def decompose(*operands: Any) -> Tensor:
     """Render as `kcgs::region_splat` does, whose arguments these are; to be traced, and slow in eager mode."""
-    arguments = SplatArguments(*operands)
+    arguments = SplatArguments.of(*operands)
     if arguments.means.ndim == 2:
         return decompose(*(None if t is None else t[None] for t in operands[:4]), *operands[4:]).squeeze(0)
     # a graph that renders only: loops cannot all be differentiated
@@ -50,7 +50,8 @@ def decompose(*operands: Any) -> Tensor:
     # not -(-height // _SIDE): division of integers rounds to zero in ONNX
     down, across = (height + _SIDE - 1) // _SIDE, (width + _SIDE - 1) // _SIDE
     counts = torch.stack([torch.full((), n, dtype=torch.int64, device=device) for n in (down, across, count)])
-    windows = None if arguments.map_operands is None else MapWindows(arguments.map_operands, _SIDE, means.dtype)
+    table = arguments.table
+    windows = None if table is None else MapWindows(table, arguments.size, _SIDE, means.dtype)
 
     def render_tile(carry: Tensor, number: Tensor, *tensors: Tensor) -> tuple[Tensor, Tensor]:
         (down, across, count), columns, rows, ids = tensors[0].unbind(), *tensors[1:4]

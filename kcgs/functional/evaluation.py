@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from kcgs.kernels import Kernel, SplatInputs, resolve, with_autograd
-from kcgs.maps import RegionMap, map_operands, membership_at, positions_of
+from kcgs.maps import RegionMap, positions_of, table_and_size, with_positions
 
-from .arguments import NO_MAP, SplatArguments
+from .arguments import SplatArguments
 from .values import check_region_ids, check_values
 
 
@@ -72,9 +72,9 @@ def squared_error_gradients(
 
     For descents: one pass over the image where the backend has it, no graph, and shapes are not checked.
     """
-    operands = NO_MAP if regions is None else map_operands(regions)[:-1]
-    gaussians = means.detach(), cholesky.detach(), colors.detach()
-    arguments = SplatArguments._make((*gaussians, region_ids, *operands, *image.shape[1:], cutoff, backend))
+    table = None if regions is None else table_and_size(regions)[0]
+    gaussians, size = (means.detach(), cholesky.detach(), colors.detach()), (image.shape[1], image.shape[2])
+    arguments = SplatArguments(*gaussians, region_ids, table, size, cutoff, backend)
     evaluation = prepare(arguments)
     kernel, inputs, plan = evaluation
     if kernel.error_gradients is None:
@@ -124,11 +124,11 @@ def _image_with_graph(arguments: SplatArguments) -> tuple[Tensor, list[Tensor]]:
 
 def _prepare(arguments: SplatArguments, check: bool) -> tuple[SplatInputs, Kernel]:
     """Return the inputs of the kernel, and the kernel."""
-    ids = regions = membership = None
-    if arguments.map_operands is not None and arguments.region_ids is not None:
-        membership, regions = membership_at(arguments.map_operands), arguments.region_ids.contiguous()
-        ids = membership.ids
-    inputs = SplatInputs(*arguments[:3], regions, membership, arguments.size, arguments.cutoff, ids)
+    ids = regions = table = None
+    if arguments.table is not None and arguments.region_ids is not None:
+        table, regions = with_positions(arguments.table), arguments.region_ids.contiguous()
+        ids = table.ids
+    inputs = SplatInputs(*arguments[:3], regions, table, arguments.size, arguments.cutoff, ids)
     kernel = resolve(arguments.backend, inputs)
     if not kernel.looks_up_regions:
         inputs = _look_up(inputs, check)
@@ -148,5 +148,5 @@ def _look_up(inputs: SplatInputs, check: bool) -> SplatInputs:
         check_region_ids(region_ids, index)
     # one region covers everything: no map, but Gaussians of other ids still paint nothing
     if len(inputs.ids) == 1 and known:
-        return inputs._replace(region_index=None, membership=None, ids=None)
+        return inputs._replace(region_index=None, table=None, ids=None)
     return inputs._replace(region_index=index, ids=None)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from kcgs._sizes import is_equal
-from kcgs.maps import LEAST_BLUR, RADIUS_SIGMAS, MapOperands, antialias, sharpness
+from kcgs.maps import LEAST_BLUR, RADIUS_SIGMAS, MapTable, antialias, sharpness, truncated_gaussian
 
 _TINY = 1e-30  # less than any sum of a blur
 _LARGEST_EXPONENT = 64  # of memberships: float32 holds the powers
@@ -24,15 +24,15 @@ class MapWindows:
     `tables` is computed once. Loops of a graph are handed all tensors that they read, and hand it to `read_tile`.
     """
 
-    def __init__(self, regions: MapOperands, side: int, dtype: torch.dtype) -> None:
-        """Prepare tiles of `side` pixels; memberships are computed in `dtype`."""
-        labels, size = regions.labels, regions.size
+    def __init__(self, table: MapTable, size: tuple[int, int], side: int, dtype: torch.dtype) -> None:
+        """Prepare tiles of `side` pixels of an image (height, width); memberships are computed in `dtype`."""
+        labels = table.labels
         device = labels.device
         self.side, self.dtype = side, dtype
         self.is_resized = not all(is_equal(new, old) for new, old in zip(size, labels.shape[-2:], strict=True))
-        self.soft = regions.blurs is not None or self.is_resized
-        self.has_widths = regions.width_index is not None
-        taps = 1 if regions.blurs is None else regions.blurs.shape[1] - 1
+        self.soft = table.blurs is not None or self.is_resized
+        self.has_widths = table.width_index is not None
+        taps = 1 if table.blurs is None else table.blurs.shape[1] - 1
         least = math.ceil(RADIUS_SIGMAS * LEAST_BLUR) if self.is_resized else 0
         self.reach = max(taps - 1, least)
         # distance at which a region around a pixel may be a part of it: antialiasing reaches one pixel farther
@@ -41,21 +41,23 @@ class MapWindows:
         self._tables_per_axis = len(down)
         maps = labels if labels.ndim == 3 else labels[None]
         numbers = torch.stack([torch.full((), n, dtype=torch.int64, device=device) for n in maps.shape])
-        images, self._widths = self._soft_tables(maps, regions) if self.soft else ((), ())
+        images, self._widths = self._soft_tables(maps, table, size) if self.soft else ((), ())
         self.tables = (numbers, *down, *across, *(image.flatten() for image in (maps, *images)), *self._widths)
 
-    def _soft_tables(self, maps: Tensor, regions: MapOperands) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+    def _soft_tables(
+        self, maps: Tensor, table: MapTable, size: tuple[int, int]
+    ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
         """Return what is read of pixels beside their labels; and widths of contours, their blurs, and the ratio."""
         widths = torch.zeros(1, dtype=torch.float64, device=maps.device)
         width_index = torch.zeros_like(maps)
-        if regions.blurs is not None:
-            widths = regions.blurs[:, 0]
+        if table.blurs is not None:
+            widths = table.blurs[:, 0]
         images: tuple[Tensor, ...] = ()
-        if regions.width_index is not None:
-            width_index = regions.width_index.long()
+        if table.width_index is not None:
+            width_index = table.width_index.long()
             images = (width_index,)
         blurs = widths
-        sides = [torch.full((), n, dtype=torch.float64, device=maps.device) for n in (*maps.shape[-2:], *regions.size)]
+        sides = [torch.full((), n, dtype=torch.float64, device=maps.device) for n in (*maps.shape[-2:], *size)]
         ratio = torch.stack([sides[2] / sides[0], sides[3] / sides[1]])
         if self.is_resized:
             is_native = (ratio == 1).all()  # which a graph of any size may be
@@ -64,9 +66,7 @@ class MapWindows:
             blurs = torch.where(is_native, widths, widths.clamp_min(LEAST_BLUR))
             weight, other_weight = torch.where(is_native, 1.0, weight), torch.where(is_native, 0.0, other_weight)
             images = (*images, weight.to(self.dtype), other, other_weight.to(self.dtype))
-        distance = torch.arange(self.reach + 1, device=maps.device)
-        taps = torch.exp(-0.5 * (distance / blurs.clamp_min(1e-9)[:, None]) ** 2)
-        taps = torch.where(distance <= (RADIUS_SIGMAS * blurs[:, None]).ceil(), taps, 0.0)
+        taps = truncated_gaussian(torch.arange(self.reach + 1, device=maps.device), blurs[:, None])
         return images, (widths.square(), taps, ratio)
 
     def _axis(self, new: int, length: int, device: torch.device) -> tuple[Tensor, ...]:

@@ -12,7 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .arguments import SplatArguments
+from kcgs.maps import PER_MAP, SHARED, MapTable
+
+from .arguments import NUM_ARGUMENTS, SCHEMA, SplatArguments, place_of
 from .evaluation import Evaluation, differentiate, differentiate_forward, differentiate_twice, prepare, render
 from .torch_internals import (
     apply,
@@ -26,20 +28,15 @@ from .torch_internals import (
     register_decomposition,
 )
 
-_ARGUMENTS = (
-    "Tensor means, Tensor cholesky, Tensor colors, Tensor? region_ids, Tensor? labels, Tensor? blurs, "
-    "Tensor? width_index, Tensor? ids, Tensor? starts, Tensor? regions, Tensor? planes, Tensor? weights, "
-    "SymInt height, SymInt width, float cutoff, str backend"
-)
-# of these, those that are not differentiated by
-_NUM_CONSTANTS = len(SplatArguments._fields) - 3
-_BACKWARD = f"Tensor grad, {_ARGUMENTS}, bool geometry"
+# arguments that are not differentiated by
+_NUM_CONSTANTS = NUM_ARGUMENTS - 3
+_BACKWARD = f"Tensor grad, {SCHEMA}, bool geometry"
 _TANGENTS = "Tensor d_means, Tensor d_cholesky, Tensor d_colors"
 _LIBRARY = torch.library.Library("kcgs", "DEF")
-_LIBRARY.define(f"region_splat({_ARGUMENTS}) -> Tensor")
+_LIBRARY.define(f"region_splat({SCHEMA}) -> Tensor")
 _LIBRARY.define(f"region_splat_backward({_BACKWARD}) -> (Tensor, Tensor, Tensor)")
 _LIBRARY.define(f"region_splat_double_backward({_TANGENTS}, {_BACKWARD}) -> (Tensor, Tensor, Tensor, Tensor)")
-_LIBRARY.define(f"region_splat_forward({_TANGENTS}, {_ARGUMENTS}) -> Tensor")
+_LIBRARY.define(f"region_splat_forward({_TANGENTS}, {SCHEMA}) -> Tensor")
 
 _THIRD = "region_splat is differentiable twice: torch.autograd.functional.vhp needs no third derivative, as hvp does"
 
@@ -65,7 +62,7 @@ class _Splat(torch.autograd.Function):
     def forward(ctx: Any, *arguments: Any) -> Tensor:
         image: Tensor
         if _is_plain(arguments[:3]):  # what is prepared stays on this side of the operator
-            image, ctx.evaluation = below_autograd(_render, SplatArguments(*arguments))
+            image, ctx.evaluation = below_autograd(_render, SplatArguments.of(*arguments))
         else:
             image, ctx.evaluation = _unrecorded(splat_operator, *arguments), None
         ctx.save_for_backward(*arguments[:3])
@@ -84,7 +81,7 @@ class _Splat(torch.autograd.Function):
         means, cholesky, colors = ctx.needs_input_grad[:3]
         gaussians, geometry = ctx.saved_tensors, means or cholesky
         if ctx.evaluation is not None and _is_plain((grad, *gaussians)) and not torch.is_grad_enabled():
-            arguments = SplatArguments(*gaussians, *ctx.constants)
+            arguments = SplatArguments.of(*gaussians, *ctx.constants)
             gradients = below_autograd(differentiate, arguments, ctx.evaluation, grad, geometry)
         else:
             gradients = _backward_operator(grad, *gaussians, *_constants(ctx), geometry)
@@ -204,7 +201,7 @@ def _unrecorded(operator: Any, *arguments: Any) -> Any:
 
 
 def _splat(*arguments: Any) -> Tensor:
-    return _render(SplatArguments(*arguments))[0]
+    return _render(SplatArguments.of(*arguments))[0]
 
 
 def _render(arguments: SplatArguments) -> tuple[Tensor, Evaluation]:
@@ -213,23 +210,23 @@ def _render(arguments: SplatArguments) -> tuple[Tensor, Evaluation]:
 
 
 def _splat_backward(grad: Tensor, *arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
-    gaussians = SplatArguments(*arguments[:-1])
+    gaussians = SplatArguments.of(*arguments[:-1])
     return differentiate(gaussians, prepare(gaussians, check=False), grad, arguments[-1])
 
 
 def _splat_double_backward(*arguments: Any) -> tuple[Tensor, ...]:
-    return differentiate_twice(arguments[:3], arguments[3], SplatArguments(*arguments[4:-1]))
+    return differentiate_twice(arguments[:3], arguments[3], SplatArguments.of(*arguments[4:-1]))
 
 
 def _splat_forward(*arguments: Any) -> Tensor:
-    return differentiate_forward(arguments[:3], SplatArguments(*arguments[3:]))
+    return differentiate_forward(arguments[:3], SplatArguments.of(*arguments[3:]))
 
 
 # Shapes, for tensors without values
 
 
 def _splat_shape(*arguments: Any) -> Tensor:
-    splat = SplatArguments(*arguments)
+    splat = SplatArguments.of(*arguments)
     return splat.colors.new_empty(*splat.colors.shape[:-2], splat.colors.shape[-1], *splat.size)
 
 
@@ -267,16 +264,14 @@ def _backward_vmap(
     return tuple(g.unflatten(0, (info.batch_size, -1)) if batched else g for g in gradients), (0, 0, 0)
 
 
-_MAP_FIELDS = ("labels", "width_index", "ids", "height")
-
-
 def _fold(info: Any, in_dims: tuple[int | None, ...], arguments: tuple[Any, ...], means: int) -> tuple[bool, list[Any]]:
     """Put the mapped dimension of every tensor into its batch; `means` is the place of that argument.
 
     Returns, first, whether there was a batch.
     """
-    labels, width_index, ids, sizes = (means + SplatArguments._fields.index(n) for n in _MAP_FIELDS)
-    if any(in_dims[k] is not None for k in range(labels + 1, sizes)):
+    places = {name: means + place_of(name) for name in MapTable._fields}
+    labels = places["labels"]
+    if any(in_dims[k] is not None for k in places.values() if k != labels):
         raise ValueError("a RegionMap cannot be mapped over: give the images as a batch")
 
     def mapped(k: int) -> Tensor:
@@ -299,9 +294,9 @@ def _fold(info: Any, in_dims: tuple[int | None, ...], arguments: tuple[Any, ...]
             part = part[:, None] if part.ndim == 3 else part
             return part.expand(-1, count, -1, -1).flatten(0, 1)
 
-        for k in (labels, width_index):
-            folded[k] = None if arguments[k] is None else each(k)
-        folded[ids:sizes] = [None] * (sizes - ids)  # they number the maps otherwise
+        for name, k in places.items():
+            if name not in SHARED:  # the others number the maps otherwise, and are made anew
+                folded[k] = each(k) if name in PER_MAP and arguments[k] is not None else None
     return batched, folded
 
 

@@ -7,9 +7,9 @@ from torch import Tensor
 
 from kcgs._check import check_cutoff, check_floating, check_ids, check_rows, check_size
 from kcgs.kernels import check_backend
-from kcgs.maps import MapOperands, RegionMap, map_operands
+from kcgs.maps import MapTable, RegionMap, table_and_size
 
-from .arguments import NO_MAP
+from .arguments import SplatArguments
 from .decomposition import decompose
 from .operator import splat_operator
 from .torch_internals import register_decomposition
@@ -81,10 +81,10 @@ def region_splat(
         if size is None:
             raise ValueError("size must be given as (height, width) where regions is None; got None")
         return splat_at(size, means, cholesky, colors, cutoff=cutoff, backend=backend)
-    operands = map_operands(regions)
-    if size not in (None, operands.size):
-        raise ValueError(f"size must equal the size of regions, {operands.size}; got {size}")
-    return splat_at(operands.size, means, cholesky, colors, region_ids, operands, cutoff=cutoff, backend=backend)
+    table, map_size = table_and_size(regions)
+    if size not in (None, map_size):
+        raise ValueError(f"size must equal the size of regions, {map_size}; got {size}")
+    return splat_at(map_size, means, cholesky, colors, region_ids, table, cutoff=cutoff, backend=backend)
 
 
 def splat_at(
@@ -93,23 +93,21 @@ def splat_at(
     cholesky: Tensor,
     colors: Tensor,
     region_ids: Tensor | None = None,
-    regions: MapOperands | None = None,
+    table: MapTable | None = None,
     *,
     cutoff: float,
     backend: str,
 ) -> Tensor:
     """Render at a size, at which the map is sampled, as by :meth:`RegionMap.resize`; ids and map come together."""
     _check_gaussians(means, cholesky, colors)
-    tensors: tuple[Tensor | None, ...] = NO_MAP
-    if regions is not None:
+    if table is not None:
         region_ids = check_ids("region_ids", region_ids, means, values=False)
-        _check_map(regions.labels, means)
-        tensors = regions[:-1]
+        _check_map(table, means)
     dtype = torch.float64 if torch.float64 in (means.dtype, cholesky.dtype, colors.dtype) else torch.float32
-    gaussians = [t if t.dtype == dtype else t.to(dtype) for t in (means, cholesky, colors)]
-    image: Tensor = splat_operator(
-        *gaussians, region_ids, *tensors, *size, check_cutoff(cutoff), check_backend(backend)
-    )
+    means, cholesky, rgb = (t if t.dtype == dtype else t.to(dtype) for t in (means, cholesky, colors))
+    backend = check_backend(backend)
+    arguments = SplatArguments(means, cholesky, rgb, region_ids, table, size, check_cutoff(cutoff), backend)
+    image: Tensor = splat_operator(*arguments.flatten())
     return image if colors.dtype == dtype else image.to(colors.dtype)
 
 
@@ -126,10 +124,10 @@ def _check_gaussians(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
         raise ValueError(f"means must hold at least one image; got shape {tuple(means.shape)}")
 
 
-def _check_map(labels: Tensor, means: Tensor) -> None:
-    if labels.device != means.device:
-        raise ValueError(f"regions must be on {means.device} with means; got {labels.device}")
-    maps = labels.shape[0] if labels.ndim == 3 else 1
+def _check_map(table: MapTable, means: Tensor) -> None:
+    if table.labels.device != means.device:
+        raise ValueError(f"regions must be on {means.device} with means; got {table.labels.device}")
+    maps = table.shape[0]
     images = means.shape[0] if means.ndim == 3 else 1
     if maps not in (1, images):
         raise ValueError(f"regions must hold 1 map or one for each of {images} images; got {maps} maps")

@@ -6,30 +6,27 @@ import numpy as np
 
 from kcgs.compiled.program import Program, inner
 
-program = Program("coarse grids")
+from .grid_columns import FIRST_TILE, TILE_COLS, TILE_ROWS
 
-# columns of the grids, see `coarse_grids.Grid`
-_ROWS = 2
-_COLS = 3
-_FIRST_TILE = 4
+program = Program("coarse grids")
 
 
 @program.entry
 def refine(starts, regions, num_regions, maps, grids):  # type: ignore[no-untyped-def]
     """Return the last four of `coarse_grids.Blocks` for the first two of level 0."""
     last = grids[len(grids) - 1]
-    tile_starts = np.empty(last[_FIRST_TILE] + maps * last[_ROWS] * last[_COLS] + 1, np.int64)
+    tile_starts = np.empty(last[FIRST_TILE] + maps * last[TILE_ROWS] * last[TILE_COLS] + 1, np.int64)
     tile_starts[: len(starts)] = starts
     blocks, end = regions, len(regions)
     tiles = np.full(num_regions, -1)  # the last that holds a region
     for level in range(1, len(grids)):
         fine, coarse = grids[level - 1], grids[level]
-        for t in range(maps * coarse[_ROWS] * coarse[_COLS]):
-            tile, first = coarse[_FIRST_TILE] + t, end
+        for t in range(maps * coarse[TILE_ROWS] * coarse[TILE_COLS]):
+            tile, first = coarse[FIRST_TILE] + t, end
             image, row, col = _place(t, coarse)
-            for y in range(max(2 * row - 1, 0), min(2 * row + 2, fine[_ROWS])):
-                for x in range(max(2 * col - 1, 0), min(2 * col + 2, fine[_COLS])):
-                    child = fine[_FIRST_TILE] + (image * fine[_ROWS] + y) * fine[_COLS] + x
+            for y in range(max(2 * row - 1, 0), min(2 * row + 2, fine[TILE_ROWS])):
+                for x in range(max(2 * col - 1, 0), min(2 * col + 2, fine[TILE_COLS])):
+                    child = fine[FIRST_TILE] + (image * fine[TILE_ROWS] + y) * fine[TILE_COLS] + x
                     for block in range(tile_starts[child], tile_starts[child + 1]):
                         region = blocks[block]
                         if tiles[region] == tile:
@@ -47,15 +44,15 @@ def refine(starts, regions, num_regions, maps, grids):  # type: ignore[no-untype
     parents, parity = np.full((end, 4), end), np.zeros(end, np.uint8)
     for level in range(len(grids)):
         fine, coarse = grids[level], grids[min(level + 1, len(grids) - 1)]
-        for t in range(maps * fine[_ROWS] * fine[_COLS]):
+        for t in range(maps * fine[TILE_ROWS] * fine[TILE_COLS]):
             image, row, col = _place(t, fine)
-            tile = fine[_FIRST_TILE] + t
+            tile = fine[FIRST_TILE] + t
             for block in range(tile_starts[tile], tile_starts[tile + 1]):
                 parity[block] = 2 * (row % 2) + col % 2
             for k in range(4 if level + 1 < len(grids) else 0):
                 y, x = (row + k // 2) // 2, (col + k % 2) // 2
-                if y < coarse[_ROWS] and x < coarse[_COLS] and row % 2 >= k // 2 and col % 2 >= k % 2:
-                    parent = coarse[_FIRST_TILE] + (image * coarse[_ROWS] + y) * coarse[_COLS] + x
+                if y < coarse[TILE_ROWS] and x < coarse[TILE_COLS] and row % 2 >= k // 2 and col % 2 >= k % 2:
+                    parent = coarse[FIRST_TILE] + (image * coarse[TILE_ROWS] + y) * coarse[TILE_COLS] + x
                     _find_parents(blocks, tile_starts, tile, parent, parents[:, k])
     return tile_starts, blocks[:end], parents, parity
 
@@ -63,7 +60,7 @@ def refine(starts, regions, num_regions, maps, grids):  # type: ignore[no-untype
 @inner
 def _place(t, grid):  # type: ignore[no-untyped-def]
     """Return map, row and column of a tile."""
-    return t // (grid[_ROWS] * grid[_COLS]), t // grid[_COLS] % grid[_ROWS], t % grid[_COLS]
+    return t // (grid[TILE_ROWS] * grid[TILE_COLS]), t // grid[TILE_COLS] % grid[TILE_ROWS], t % grid[TILE_COLS]
 
 
 @inner

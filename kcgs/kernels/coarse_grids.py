@@ -73,7 +73,7 @@ def grids_of(size: tuple[int, int], maps: int) -> tuple[Grid, ...]:
 
 
 def make_blocks(starts: Any, regions: Any, num_regions: int, shape: tuple[int, ...]) -> Blocks:
-    """Return the blocks of all levels for the regions of tiles, as of `Coverage`, of maps of a shape (maps, H, W)."""
+    """Return the blocks of all levels for the regions of tiles, as of `MapTable`, of maps of a shape (maps, H, W)."""
     from .blocks import refine  # loads numba
 
     maps, *size = shape

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from kcgs.maps import Coverage, Membership
+from kcgs.maps import MapTable
 
 Gradients = tuple[Tensor | None, Tensor | None, Tensor]
 
@@ -24,15 +24,10 @@ class SplatInputs(NamedTuple):
     cholesky: Tensor  # [B, N, 3] pixels
     colors: Tensor  # [B, N, C]
     region_index: Tensor | None  # [B, N] int64, position in the sorted list of regions; -1: not in the map
-    membership: Membership | None  # None: one region covers everything
+    table: MapTable | None  # of the map at its own size, with positions; None: one region covers everything
     size: tuple[int, int]  # (height, width)
     cutoff: float
     ids: Tensor | None = None  # [R] int64, sorted: where given, `region_index` holds ids that the kernel looks up
-
-    @property
-    def coverage(self) -> Coverage | None:
-        """The map's table of tiles."""
-        return None if self.membership is None else self.membership.coverage
 
     @property
     def gaussians(self) -> tuple[Tensor, Tensor, Tensor]:

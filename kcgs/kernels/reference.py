@@ -11,6 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kcgs.maps import membership_at
+
 from .interface import Gradients, Kernel, SplatInputs, with_autograd
 from .whitened import Z_LIMIT
 
@@ -58,12 +60,12 @@ def splat(inputs: SplatInputs) -> Tensor:
 
 def _regions(inputs: SplatInputs, b: int) -> Iterator[tuple[Tensor, Tensor | None]]:
     """Yield the Gaussians of each region of an image and the membership of its pixels, (H * W,); None: 1 everywhere."""
-    membership, index = inputs.membership, inputs.region_index
-    if membership is None or index is None:
+    table, index = inputs.table, inputs.region_index
+    if table is None or index is None:
         yield torch.arange(inputs.means.shape[1], device=inputs.means.device), None
         return
-    map_index = b if membership.labels.shape[0] > 1 else 0
-    for region in range(membership.num_regions):
+    membership, map_index = membership_at(table, inputs.size), b if table.shape[0] > 1 else 0
+    for region in range(table.num_regions):
         members = (index[b] == region).nonzero().flatten()
         if len(members):
             yield members, membership.weights(map_index, region, inputs.means.dtype).flatten()

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad, threshold
 
-from kcgs.maps import TILE, Coverage
+from kcgs.maps import TILE, table_at
 
 from .interface import Gradients, Kernel, SplatInputs, with_autograd
 from .tiles import (
@@ -67,8 +67,8 @@ def kernel_for(inputs: SplatInputs) -> Kernel:
 
 
 def _make_plan(inputs: SplatInputs) -> _Plan:
-    coverage, num_regions = _tile_regions(inputs)
-    grid, keys = grid_of(inputs), keys_of(coverage, num_regions)
+    starts, regions, planes, weights, num_regions = _tile_regions(inputs)
+    grid, keys = grid_of(inputs), keys_of(starts, regions, num_regions)
     gaussian, block, affine = _list_pairs(inputs, grid, keys, num_regions)
     order = torch.argsort(block, stable=True)
     blocks, lengths = torch.unique_consecutive(block[order], return_counts=True)
@@ -79,23 +79,23 @@ def _make_plan(inputs: SplatInputs) -> _Plan:
     image, row = blocks[run] // len(keys), blocks[run] % len(keys)
     tiles = grid.rows * grid.cols
     tile = image * tiles + keys[row] // num_regions % tiles
-    masks = pad(coverage.weights.to(affine.dtype), (0, 0, 0, 1), value=1.0)
-    return _Plan(gaussian, affine, pieces, tile, coverage.planes[row], masks)
+    masks = pad(weights.to(affine.dtype), (0, 0, 0, 1), value=1.0)
+    return _Plan(gaussian, affine, pieces, tile, planes[row], masks)
 
 
-def _tile_regions(inputs: SplatInputs) -> tuple[Coverage, int]:
-    """Return the regions of tiles, and the number of regions; without a map, one is everywhere."""
-    if inputs.membership is not None:
-        return inputs.membership.coverage, inputs.membership.num_regions
+def _tile_regions(inputs: SplatInputs) -> tuple[Tensor, Tensor, Tensor, Tensor, int]:
+    """Return the tiles of the map, and the number of regions; without a map, one is everywhere."""
+    if inputs.table is not None:
+        return *table_at(inputs.table, inputs.size).tiles, inputs.table.num_regions
     grid = grid_of(inputs)
     starts = torch.arange(grid.rows * grid.cols + 1, device=inputs.means.device)
     alone = torch.zeros_like(starts[1:])
-    return Coverage(starts, alone, alone - 1, inputs.means.new_zeros(0, TILE * TILE)), 1
+    return starts, alone, alone - 1, inputs.means.new_zeros(0, TILE * TILE), 1
 
 
-def keys_of(coverage: Coverage, num_regions: int) -> Tensor:
+def keys_of(starts: Tensor, regions: Tensor, num_regions: int) -> Tensor:
     """Return tile * num_regions + region of each entry, which ascend."""
-    return torch.repeat_interleave(coverage.starts.diff()) * num_regions + coverage.regions
+    return torch.repeat_interleave(starts.diff()) * num_regions + regions
 
 
 def _list_pairs(inputs: SplatInputs, grid: TileGrid, keys: Tensor, num_regions: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -107,7 +107,7 @@ def _list_pairs(inputs: SplatInputs, grid: TileGrid, keys: Tensor, num_regions: 
     radius = support_radius(inputs.cutoff, inputs.means.dtype)
     gaussian, place, origin = bounding_tiles(means, cholesky, radius, inputs.size)
     image, tile = gaussian // inputs.means.shape[1], place[:, 1] * grid.cols + place[:, 0]
-    if inputs.membership is not None and len(inputs.membership.labels) > 1:
+    if inputs.table is not None and inputs.table.shape[0] > 1:
         tile = image * grid.rows * grid.cols + tile
     region = torch.zeros_like(gaussian) if inputs.region_index is None else inputs.region_index.flatten()[gaussian]
     row, is_present = find_keys(keys, tile, region, num_regions)

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from kcgs._labels import check_labels, is_label_source
 
-from .operands import MapOperands
 from .regions import RegionMap
+from .table import MapTable
 
 
 def as_region_map(value: object, name: str = "regions") -> RegionMap | None:
@@ -20,12 +20,12 @@ def as_region_map(value: object, name: str = "regions") -> RegionMap | None:
     raise TypeError(f"{name} must be a RegionMap, a label map or None; got {type(value).__name__}")
 
 
-def map_operands(regions: object) -> MapOperands:
-    """Return a map as the operator takes it, which also checks the values of labels; refuse anything else."""
+def table_and_size(regions: object) -> tuple[MapTable, tuple[int, int]]:
+    """Return the table of a map, of labels those alone, and the size at which it is sampled; refuse anything else."""
     if isinstance(regions, RegionMap):
-        return regions._operands
+        return regions._table, regions.size
     if isinstance(regions, (Tensor, np.ndarray)):  # graphs of torch 2.7 know no other form
-        labels = check_labels("regions", regions, values=False)
-        return MapOperands(labels, size=(labels.shape[-2], labels.shape[-1]))
+        table = MapTable(check_labels("regions", regions, values=False))
+        return table, table.size
     hint = ": RegionMap.from_labels reads it, once for all renders" if is_label_source(regions) else ""
     raise TypeError(f"regions must be a RegionMap, a Tensor, an array or None; got {type(regions).__name__}{hint}")

@@ -12,28 +12,33 @@ from kcgs.compiled.tasks import first_task, next_task
 
 program = Program("tables of label maps")
 
-SIDE = 16  # of a tile of `Coverage`: a number, so that the compiler makes vectors of rows
+SIDE = 16  # of a tile of `MapTable`: a number, so that the compiler makes vectors of rows
 
 
 @program.entry
 def number_regions(labels, limit, index):  # type: ignore[no-untyped-def]
-    """Fill the position of each pixel's label among the ids, which are returned; none where one is not below a limit.
+    """Fill the position of each pixel's label among the ids, which are returned; none unless all are in [0, limit).
 
     Labels, (N,), and index, (N,), are flat.
     """
-    largest = 0
+    positions = np.full(limit, -1, np.int32)
+    last, largest = -1, 0
     for label in labels:
-        largest = max(largest, label)
-    if largest >= limit:
-        return np.empty(0, np.int64)
-    positions = np.full(largest + 1, -1, np.int32)
-    for label in labels:
+        if label == last:
+            continue
+        if label < 0 or label >= limit:
+            return np.empty(0, np.int64)
         positions[label] = 0
-    ids = np.flatnonzero(positions == 0)
+        last, largest = label, max(largest, label)
+    ids = np.flatnonzero(positions[: largest + 1] == 0)
     for k in range(len(ids)):
         positions[ids[k]] = k
+    last, position = -1, 0
     for n in range(len(labels)):
-        index[n] = positions[labels[n]]
+        if labels[n] != last:
+            last = labels[n]
+            position = positions[last]
+        index[n] = position
     return ids
 
 
@@ -93,7 +98,7 @@ def list_window_regions(starts, regions, shape, places, span, num_regions):  # t
     """Return the same for windows of `span` pixels at places, (T, 3): the regions of the tiles that they touch.
 
     Args:
-        starts: of a `Coverage`.
+        starts: of a `MapTable`.
         regions: of it.
         shape: maps, height and width.
         places: map, first row and first column; rows and columns may lie beyond the image.
@@ -134,7 +139,7 @@ def _insert(values, first, end, value):  # type: ignore[no-untyped-def]
 
 @program.entry
 def cut_windows(starts, regions, planes, weights, shape, places, members, windows, tasks, counters):  # type: ignore[no-untyped-def]
-    """Fill the membership of regions, (P,), over windows, (P, h, w), at places, (P, 3), out of a `Coverage`.
+    """Fill the membership of regions, (P,), over windows, (P, h, w), at places, (P, 3), out of a `MapTable`.
 
     `shape` is as of `list_window_regions`; membership is 0 beyond the tiles. Tasks are ranges of windows.
     """
@@ -165,7 +170,7 @@ def _copy_plane(plane, weights, top, left, window):  # type: ignore[no-untyped-d
 
 @program.entry
 def fill_planes(index, smooth, width_index, taps, starts, regions, planes, weights, tasks, counters):  # type: ignore[no-untyped-def]
-    """Fill the membership of regions in the tiles of a `Coverage` that several share.
+    """Fill the membership of regions in the tiles of a `MapTable` that several share.
 
     Labels are those of `index`, or, where the arrays of `smooth`, a tuple as of `SmoothLabels`, are not empty, those.
     Row k of taps is half of the blur for pixels of width k, its centre first, then zeros; `width_index` is empty where

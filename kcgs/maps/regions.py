@@ -11,13 +11,14 @@ from torch import Tensor
 from kcgs._check import check_size
 from kcgs._labels import check_labels
 
+from .derived import table_at
 from .labels import compact, positions_of, sample_labels, touching_pairs, union_find
-from .membership import Membership
-from .operands import MapOperands, membership_at
 from .softness import PairSoftness, check_softness, merged_softness, scaled_softness, softness_by_position
+from .table import MapTable, full_map
+from .tiles import with_tiles
 from .widths import blurs_of, find_widths
 
-# of a table that a map keeps: 1 GiB; every render makes that of a map of noise, which a small file may hold
+# of the tiles that a map keeps: 1 GiB; every render makes those of a map of noise, which a small file may hold
 _MOST_PLANES = 1 << 20
 
 
@@ -39,7 +40,7 @@ class RegionMap:
     _labels: Tensor
     _softness: float | PairSoftness
     _index: Tensor  # [maps, H, W] int32
-    _operands: MapOperands
+    _table: MapTable  # of the map, or of the one that it was interpolated from
     _source: RegionMap | None  # the map that this one was interpolated from
 
     def __init__(self, labels: Any, softness: float | Mapping[tuple[int, int], float] = 0.0) -> None:
@@ -73,11 +74,7 @@ class RegionMap:
         self._softness = check_softness(softness, ids)
         widths, pixels = find_widths(self._index, len(ids), softness_by_position(self._softness, ids))
         blurs = None if widths == (0.0,) else blurs_of(widths, labels.device)
-        membership = Membership(self._index, ids, blurs, pixels)
-        membership.index = self._index
-        is_noise = labels.device.type == "cpu" and membership.num_planes > _MOST_PLANES
-        operands = MapOperands(labels, blurs, pixels, ids, size=(labels.shape[-2], labels.shape[-1]))
-        self._operands = operands if is_noise else operands._replace(**membership.coverage._asdict())
+        self._table = with_tiles(MapTable(labels, blurs, pixels, ids, self._index), _MOST_PLANES)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Leave out what is derived: torch moves the memory of tensors that it sends to another process."""
@@ -104,7 +101,7 @@ class RegionMap:
     @property
     def ids(self) -> Tensor:
         """The distinct ids, (R,) int64, sorted."""
-        ids = self._operands.ids
+        ids = self._table.ids
         assert ids is not None
         return ids
 
@@ -169,8 +166,8 @@ class RegionMap:
             raise ValueError(f"membership needs one map; got a batch of {self.num_maps}")
         ids = [region_ids] if isinstance(region_ids, int) else sorted(set(region_ids))
         places = self.index_of(torch.tensor(ids, dtype=torch.int64, device=self.ids.device)).tolist()
-        membership = membership_at(self._operands)
-        parts = [membership.full_map(0, place) for place in places if place >= 0]
+        table = table_at(self._table, self.size)
+        parts = [full_map(table, 0, place) for place in places if place >= 0]
         black = torch.zeros(self.size, dtype=torch.float64, device=self.ids.device)
         return (sum(parts[1:], parts[0]) if parts else black).to(dtype)
 
@@ -245,9 +242,9 @@ class RegionMap:
         if self._source is not None:
             return self._source._with_tensors(function).resize(self.size)
         regions = RegionMap.__new__(RegionMap)
-        parts = (function(part) if isinstance(part, Tensor) else part for part in self._operands)
-        regions._operands = MapOperands._make(parts)
-        regions._labels, regions._index = regions._operands.labels, function(self._index)
+        table = regions._table = MapTable._make(None if part is None else function(part) for part in self._table)
+        assert table.positions is not None
+        regions._labels, regions._index = table.labels, table.positions
         regions._softness, regions._source = self._softness, None
         return regions
 
@@ -326,7 +323,7 @@ class RegionMap:
             return self._source.resize((height, width))
         regions = RegionMap.__new__(RegionMap)
         regions._labels, regions._index = (sample_labels(t, height, width) for t in (self._labels, self._index))
-        regions._operands, regions._source = self._operands._replace(size=(height, width)), self
+        regions._table, regions._source = self._table, self
         ratio = height * width / (self.size[0] * self.size[1])
         regions._softness = scaled_softness(self._softness, ratio)
         return regions

@@ -13,9 +13,10 @@ import torch
 from torch import Tensor
 
 from .antialiasing import SmoothLabels, antialias
-from .coverage import TILE, Coverage
 from .labels import sample_labels
-from .membership import Membership, to_array
+from .membership import Membership
+from .table import TILE, MapTable
+from .tiles import to_array, with_smooth_tiles
 from .widths import blurs_of
 
 # windows of a task
@@ -35,19 +36,23 @@ class SmoothMembership(Membership):
     """
 
     margin = 1
-    plane_dtype = np.float64
 
     def __init__(self, source: Membership) -> None:
         """Take the map at its own size."""
+        table = MapTable(*(None if part is None else part.cpu() for part in source.table.without_tiles()))  # type: ignore[arg-type]
         blurs = blurs_of([max(width, LEAST_BLUR) for width in source.widths], torch.device("cpu"))
-        width_index = None if source.width_index is None else source.width_index.cpu()
-        super().__init__(source.labels.cpu(), source.ids.cpu(), blurs, width_index)
+        super().__init__(table._replace(blurs=blurs))
         self.source = source
 
     @functools.cached_property
     def smooth_labels(self) -> SmoothLabels:
         """The antialiased labels."""
         return antialias(self.index, (self.source.variances < LEAST_BLUR**2).cpu())
+
+    @functools.cached_property
+    def tiles(self) -> MapTable:
+        """The table with the tiles of the antialiased labels."""
+        return with_smooth_tiles(self.table, self.smooth_labels)
 
     def _inside(self, batch: int, region: int) -> Tensor:
         weight, other, other_weight = (part[batch] for part in self.smooth_labels)
@@ -74,28 +79,30 @@ class Resampled(Membership):
 
     def __init__(self, smooth: SmoothMembership, size: tuple[int, int]) -> None:
         """Take what is interpolated, and a size."""
-        source = smooth.source
-        super().__init__(sample_labels(source.labels, *size), source.ids)
+        source, table = smooth.source, smooth.source.table
+        index = sample_labels(source.index, *size)
+        labels = sample_labels(table.labels.view(table.shape), *size)
+        super().__init__(MapTable(labels, ids=table.ids, positions=index))
         self.source, self.smooth = source, smooth
-        self.ratio = math.prod(size) / math.prod(source.labels.shape[1:])
+        self.ratio = math.prod(size) / math.prod(table.size)
 
     @functools.cached_property
-    def coverage(self) -> Coverage:
-        """The table for tiles of 16 pixels, made on the CPU."""
-        return Coverage(*(part.to(self.labels.device) for part in self._make_coverage()))
+    def tiles(self) -> MapTable:
+        """The table at this size, made on the CPU."""
+        return self.table.replace_tiles(part.to(self.index.device) for part in self._make_tiles())
 
     def weights(self, batch: int, region: int, dtype: torch.dtype) -> Tensor:
         """Evaluate s_r of one region over one whole map, (H, W): the definition, without tables."""
         exponent, largest, total = self._sums[batch]
-        return ((self._interpolated(batch, region) / largest) ** exponent / total).to(self.labels.device, dtype)
+        return ((self._interpolated(batch, region) / largest) ** exponent / total).to(self.index.device, dtype)
 
     @functools.cached_property
     def _sums(self) -> list[tuple[Tensor, Tensor, Tensor]]:
         """The exponents e of each map, the largest u of each pixel, and the sum of all (u / largest)**e."""
         sums = []
-        for batch in range(len(self.labels)):
+        for batch in range(len(self.index)):
             exponent = sharpness(self._interpolate(self.source.variances[batch].cpu()), self.ratio)
-            regions = range(self.num_regions)
+            regions = range(self.table.num_regions)
             largest = functools.reduce(torch.maximum, (self._interpolated(batch, r) for r in regions))
             powers = ((self._interpolated(batch, r) / largest) ** exponent for r in regions)
             sums.append((exponent, largest, functools.reduce(torch.add, powers)))
@@ -111,10 +118,10 @@ class Resampled(Membership):
 
     def _axes(self, tile: int) -> list[_Axis]:
         """Return the axes of rows and columns, padded to whole tiles with their last pixel."""
-        sizes = zip(self.labels.shape[1:], self.source.labels.shape[1:], strict=True)
+        sizes = zip(self.table.size, self.source.table.size, strict=True)
         return [_axis(new, old, tile) for new, old in sizes]
 
-    def _make_coverage(self) -> Coverage:
+    def _make_tiles(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         axes = self._axes(TILE)
         firsts = [axis.low[::TILE] for axis in axes]
         spans = [int((axis.high[TILE - 1 :: TILE] - first).max()) + 1 for axis, first in zip(axes, firsts, strict=True)]
@@ -122,10 +129,10 @@ class Resampled(Membership):
             _matrix(_Axis(*(part.view(-1, TILE) for part in axis)), first, span)
             for axis, first, span in zip(axes, firsts, spans, strict=True)
         )  # [tiles of the axis, 16, span] each
-        counts = (len(self.labels), *map(len, firsts))
+        counts = (len(self.index), *map(len, firsts))
         batch, row, col = torch.cartesian_prod(*map(torch.arange, counts)).unbind(1)
         corners = torch.stack([batch, firsts[0][row], firsts[1][col]], 1)
-        tile, region = find_windows(self.smooth, corners, spans)
+        tile, region = find_windows(self.smooth.tiles, corners, spans)
         is_shared = torch.bincount(tile)[tile] > 1
         shared = is_shared.nonzero().flatten()
         planes = torch.zeros(len(shared), TILE * TILE, dtype=torch.float64)
@@ -136,7 +143,7 @@ class Resampled(Membership):
             t, position = tile[pairs].unique_consecutive(return_inverse=True)
             y, x = down[row[t]], across[col[t]].mT
             exponent = sharpness(y @ _read(variances, corners[t], spans) @ x, self.ratio)
-            windows = cut_windows(self.smooth, corners[t[position]], region[pairs], spans)
+            windows = cut_windows(self.smooth.tiles, corners[t[position]], region[pairs], spans)
             planes[chunk] = _sharpen(y[position] @ windows @ x[position], position, exponent[position]).flatten(1)
         # some of a tile's regions have no weight there
         is_present = (planes > 0).any(1)
@@ -146,25 +153,24 @@ class Resampled(Membership):
         rows = torch.full_like(tile, -1)
         rows[shared] = torch.where(is_present, is_present.cumsum(0) - 1, -1)
         weights = planes[is_present].float()
-        return Coverage(starts, region[is_listed].int(), rows[is_listed].int(), weights)
+        return starts, region[is_listed].int(), rows[is_listed].int(), weights
 
 
-def find_windows(membership: Membership, places: Tensor, span: Sequence[int]) -> tuple[Tensor, Tensor]:
+def find_windows(table: MapTable, places: Tensor, span: Sequence[int]) -> tuple[Tensor, Tensor]:
     """List the regions of windows of `span` pixels at places, (T, 3): the window of each, ascending, and the region.
 
     Places are map, first row and first column. Regions are those of the tiles that a window touches.
     """
     from .loops import list_window_regions  # loads numba
 
-    starts, regions = (to_array(part) for part in membership.coverage[:2])
-    shape = tuple(membership.labels.shape)
-    arguments = starts, regions, shape, to_array(places), tuple(span), membership.num_regions
+    starts, regions = (to_array(part) for part in table.tiles[:2])
+    arguments = starts, regions, table.shape, to_array(places), tuple(span), table.num_regions
     counts, entries = map(torch.from_numpy, list_window_regions(*arguments))
     return torch.repeat_interleave(counts), entries.long()
 
 
-def cut_windows(membership: Membership, places: Tensor, regions: Tensor, span: Sequence[int]) -> Tensor:
-    """Read s_r over windows of `span` pixels at places, (P, 3), out of the table: (P, *span) float64.
+def cut_windows(table: MapTable, places: Tensor, regions: Tensor, span: Sequence[int]) -> Tensor:
+    """Read s_r over windows of `span` pixels at places, (P, 3), out of tiles: (P, *span) float64.
 
     Windows may reach beyond the image, where s_r has no meaning.
     """
@@ -173,8 +179,7 @@ def cut_windows(membership: Membership, places: Tensor, regions: Tensor, span: S
     from .loops import cut_windows as cut
 
     windows = np.empty((len(regions), *span))
-    table, shape = map(to_array, membership.coverage), tuple(membership.labels.shape)
-    loop = partial(cut, *table, shape, to_array(places), to_array(regions), windows)
+    loop = partial(cut, *map(to_array, table.tiles), table.shape, to_array(places), to_array(regions), windows)
     run_tasks(loop, ranges(len(regions), _TASK_WINDOWS))
     return torch.from_numpy(windows)
 

@@ -12,6 +12,8 @@ from torch import Tensor
 
 # reach of a contour, in widths: the blur's kernel is cut there
 RADIUS_SIGMAS = 4.0
+# pixels: in place of 0 where a distance is divided by a width
+_LEAST_WIDTH = 1e-9
 # distances that are compared at once: 64 MiB in int32
 _CHUNK_DISTANCES = 1 << 24
 # more than any image has rows
@@ -32,6 +34,18 @@ def reach_of(width: float) -> int:
     return math.ceil(RADIUS_SIGMAS * width)
 
 
+def truncated_gaussian(distance: Tensor, width: Tensor | float) -> Tensor:
+    """Evaluate exp(-0.5 (distance / width)^2) up to `RADIUS_SIGMAS` widths, rounded up to whole pixels, and 0 beyond.
+
+    A width of 0 has 1 at distance 0. Distances are not negative, and floating where the width is a number.
+    """
+    if isinstance(width, Tensor):
+        is_near, ratio = distance <= (RADIUS_SIGMAS * width).ceil(), distance / width.clamp_min(_LEAST_WIDTH)
+    else:
+        is_near, ratio = distance <= reach_of(width), distance / max(width, _LEAST_WIDTH)
+    return torch.where(is_near, torch.exp(-0.5 * ratio**2), 0.0)
+
+
 def blurs_of(widths: Sequence[float], device: torch.device) -> Tensor:
     """Return a row for each width, float64: the width, then half of its blur, from the middle; the shape says how far.
 
@@ -39,9 +53,7 @@ def blurs_of(widths: Sequence[float], device: torch.device) -> Tensor:
     """
     width = torch.tensor(widths, dtype=torch.float64)[:, None]
     distance = torch.arange(reach_of(max(widths)) + 1, dtype=torch.float64)
-    taps = torch.exp(-0.5 * (distance / width.clamp_min(1e-9)) ** 2)
-    taps = torch.where(distance <= (RADIUS_SIGMAS * width).ceil(), taps, 0.0)
-    return torch.cat([width, taps], 1).to(device, non_blocking=True)
+    return torch.cat([width, truncated_gaussian(distance, width)], 1).to(device, non_blocking=True)
 
 
 def find_widths(index: Tensor, num_regions: int, softness: float | Mapping[tuple[int, int], float]) -> ContourWidths:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from kcgs._check import check_cutoff, check_size
 from kcgs._sizes import is_equal
 from kcgs.functional import RegionMap, splat_at
-from kcgs.maps import map_operands
+from kcgs.maps import table_and_size
 
 from .field import GaussianField, scaled_gaussians
 
@@ -87,23 +87,23 @@ class RegionSplatRenderer(nn.Module):
             regions = field.regions if regions is None else regions
             field = field.field
         size = field.size if size is None else check_size("size", size)
-        operands = None if regions is None else map_operands(regions)
-        if operands is None and field.region_ids is not None:
+        table, map_size = (None, size) if regions is None else table_and_size(regions)
+        if table is None and field.region_ids is not None:
             raise ValueError(
                 "regions must be given for a field that is confined to regions; got None: pass its label map or its "
                 "Scene, or set field.region_ids to None to render it without contours"
             )
-        if operands is not None and field.region_ids is None:
+        if table is not None and field.region_ids is None:
             raise ValueError("field must have region_ids where regions are given; call field.assign_regions(regions)")
-        if operands is not None and operands.size not in (field.size, size):
+        if map_size not in (field.size, size):
             other = "" if size == field.size else f" or {size}"
-            raise ValueError(f"regions must have the size {field.size} of the field{other}; got {operands.size}")
+            raise ValueError(f"regions must have the size {field.size} of the field{other}; got {map_size}")
         # a map of the image's size does not say what there is between its pixels
-        resized = operands is not None and operands.size != field.size
+        resized = table is not None and map_size != field.size
         fine = size if resized else rendered_size(field.size, size)
         means, cholesky = scaled_gaussians(field, fine)
         image = splat_at(
-            fine, means, cholesky, field.merged_colors(), field.region_ids, operands,
+            fine, means, cholesky, field.merged_colors(), field.region_ids, table,
             cutoff=self.cutoff, backend=self.backend,
         )  # fmt: skip
         image = area_mean(image, size)

@@ -10,7 +10,7 @@ import torch
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from kcgs.maps import RADIUS_SIGMAS, TILE, Membership
+from kcgs.maps import RADIUS_SIGMAS, TILE, Membership, SmoothMembership
 
 from .graph import FLOAT, Graph, Value
 from .groups import Integers
@@ -28,7 +28,7 @@ class BlurredWindows:
     def __init__(self, g: Graph, membership: Membership, tiles: Tiles, tiles_of: Mapping[int, Integers]) -> None:
         self.graph = g
         self.tiles_of = tiles_of
-        ids, index = tile_ids(tiles_of), membership.width_index
+        ids, index = tile_ids(tiles_of), membership.table.width_index
         width_index = np.zeros((len(ids), WINDOW, WINDOW), np.int64)
         if index is not None:
             width_index = cut_windows(tiles, ids, index[0].cpu().numpy())
@@ -45,7 +45,7 @@ class BlurredWindows:
         pixels = _pixel_windows(g, tiles, ids, kinds, membership.radius, len(table) - 1)[window]
         label, weight, other, other_weight = (column[:, 0] for column in np.split(table, 4, axis=1))
         inside = g.Equal(g.constant(label.astype(np.int32))[pixels], region).astype(FLOAT)
-        if membership.smooth_labels is not None:
+        if isinstance(membership, SmoothMembership):
             taken = g.Equal(g.constant(other.astype(np.int32))[pixels], region).astype(FLOAT)
             weights = (g.constant(part.astype(np.float32))[pixels] for part in (weight, other_weight))
             inside = inside * next(weights) + taken * next(weights)
@@ -73,10 +73,11 @@ def _list_kinds(membership: Membership) -> tuple[NDArray[np.float64], Integers]:
     The last kind is that of pixels outside.
     """
     index, none = membership.index, torch.zeros_like(membership.index)
-    parts = (index, *(membership.smooth_labels or (none, none, none)))
-    rows = torch.stack([part[0].double().flatten() for part in parts], 1).cpu().numpy()
+    smooth = membership.smooth_labels if isinstance(membership, SmoothMembership) else (none, none, none)
+    rows = torch.stack([part[0].double().flatten() for part in (index, *smooth)], 1).cpu().numpy()
     table, kinds = np.unique(rows, axis=0, return_inverse=True)
-    outside = [[membership.num_regions + 1, 0, 0, 0]]  # a label that no region has, nor what fills up lists of regions
+    # a label that no region has, nor what fills up lists of regions
+    outside = [[membership.table.num_regions + 1, 0, 0, 0]]
     return np.concatenate([table, outside]), kinds.reshape(index.shape[1:])
 
 

@@ -29,7 +29,7 @@ def make_membership(storage: Storage, down: Axis, across: Axis) -> MembershipSam
         return None
     places = Interpolator(down, across, down.sampling(), across.sampling(), WINDOW)
     ratio = 1 / (down.step * across.step)
-    widths, width_index = membership.widths, membership.width_index
+    widths, width_index = membership.widths, membership.table.width_index
     stored = smooth.radius > _FARTHEST
     windows, smooth_windows = (
         stored_windows(g, m, tiles, tiles_of) if stored else BlurredWindows(g, m, tiles, tiles_of).unfold

@@ -8,7 +8,15 @@ import torch
 from torch import Tensor
 
 from kcgs.functional import RegionMap
-from kcgs.maps import TILE, Membership, SmoothMembership, cut_windows, find_windows, map_operands, membership_at
+from kcgs.maps import (
+    TILE,
+    Membership,
+    SmoothMembership,
+    cut_windows,
+    find_windows,
+    membership_at,
+    table_and_size,
+)
 
 # side of a window: a tile and the pixels around it, those of the border of the scene repeated beyond it
 WINDOW = TILE + 2
@@ -30,11 +38,11 @@ def find_tiles(regions: RegionMap | None, size: tuple[int, int]) -> Tiles:
     rows, cols = -(-size[0] // TILE), -(-size[1] // TILE)
     if regions is None or regions.num_regions == 1:
         return Tiles(rows, cols, [[0]] * (rows * cols), set())
-    membership = membership_at(map_operands(regions))
+    membership = membership_at(*table_and_size(regions))
     smooth = SmoothMembership(membership)
     # a window reaches into the tiles around it
     numbers = torch.arange(rows * cols)
-    tile, region = find_windows(smooth, _corners(numbers, cols), (WINDOW, WINDOW))
+    tile, region = find_windows(smooth.tiles, _corners(numbers, cols), (WINDOW, WINDOW))
     mixed = torch.bincount(tile)[tile] > 1
     windows = read_memberships(smooth, tile[mixed], cols, region[mixed])
     positive = windows.flatten(1).amax(1) > 0
@@ -54,9 +62,9 @@ def _corners(tile: Tensor, cols: int) -> Tensor:
 def read_memberships(membership: Membership, tile: Tensor, cols: int, region: Tensor) -> Tensor:
     """Read a region over the window of a tile, (P, WINDOW, WINDOW), for P pairs of both."""
     corners = _corners(tile, cols)
-    weights = cut_windows(membership, corners, region, (WINDOW, WINDOW))
+    weights = cut_windows(membership.tiles, corners, region, (WINDOW, WINDOW))
     down, across = (
         (begin[:, None] + torch.arange(WINDOW)).clamp(0, length - 1) - begin[:, None]
-        for begin, length in zip(corners.unbind(1)[1:], membership.labels.shape[1:], strict=True)
+        for begin, length in zip(corners.unbind(1)[1:], membership.table.size, strict=True)
     )
     return weights.gather(1, down[:, :, None].expand_as(weights)).gather(2, across[:, None, :].expand_as(weights))

@@ -60,7 +60,10 @@ class Objective(ABC):
         return False
 
     def gradients(self, renderer: Renderer, gaussians: Gaussians, render: Tensor | None = None) -> Gaussians:
-        """Return the gradients by Gaussians, times the factor of `slope`; a render may be given, with a graph to them."""
+        """Return the gradients by Gaussians, times the factor of `slope`.
+
+        A render may be given, with a graph to them.
+        """
         leaves = gaussians
         if render is None:
             leaves = gaussians.map(lambda table: table.detach().requires_grad_())

@@ -11,7 +11,7 @@ from torch import Tensor
 from kcgs.kernels import SplatInputs, reference
 from kcgs.kernels.coarse_grids import choose_levels, coarsen, grids_of, max_spacing
 from kcgs.kernels.cpu import kernel as cpu
-from kcgs.maps import Membership
+from kcgs.maps import MapTable, membership_at, with_positions
 from kcgs.maps.widths import blurs_of
 
 CUTOFF = 1e-4
@@ -32,9 +32,9 @@ def make_inputs(
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     labels = ((x - width / 2) ** 2 + (y - height / 3) ** 2 < (height / 3) ** 2).long() + 2 * (x + y > width).long()
     labels = torch.stack([labels.roll(5 * k, 1) for k in range(maps)])
-    membership = Membership(labels, torch.arange(4), blurs_of((softness,), labels.device))
+    table = with_positions(MapTable(labels, blurs_of((softness,), labels.device)))
     ids = torch.randint(-1, 4, (batch, n), generator=generator)
-    return SplatInputs(means, cholesky, colors, ids, membership, size, CUTOFF)
+    return SplatInputs(means, cholesky, colors, ids, table, size, CUTOFF)
 
 
 def double(inputs: SplatInputs) -> SplatInputs:
@@ -59,13 +59,14 @@ def render_formulas(inputs: SplatInputs) -> list[Tensor]:
     images = []
     for b in range(len(leaves[0])):
         gaussians = [t[b] for t in leaves]
-        if inputs.membership is None or inputs.region_index is None:
+        if inputs.table is None or inputs.region_index is None:
             images.append(_render_region(*gaussians, inputs))
             continue
         total = torch.zeros(3, *inputs.size, dtype=torch.float64)
-        for region in range(inputs.membership.num_regions):
+        membership = membership_at(inputs.table, inputs.size)
+        for region in range(inputs.table.num_regions):
             members = inputs.region_index[b] == region
-            weights = inputs.membership.weights(b % len(inputs.membership.labels), region, torch.float64)
+            weights = membership.weights(b % inputs.table.shape[0], region, torch.float64)
             total = total + weights * _render_region(*(t[members] for t in gaussians), inputs)
         images.append(total)
     image = torch.stack(images)

@@ -16,8 +16,8 @@ from kcgs.functional import region_splat
 from kcgs.functional.operator import splat_operator
 from kcgs.kernels import SplatInputs, cuda, reference, settle, without_waiting
 from kcgs.kernels.cuda import capacity, gather, plan, render, triton_function
-from kcgs.maps import Membership, find_widths
-from kcgs.maps.widths import blurs_of
+from kcgs.maps import MapTable, with_positions
+from kcgs.maps.widths import blurs_of, find_widths
 from kcgs.optim import GaussianAdam
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -49,24 +49,24 @@ def make_inputs(
     means = uniform(batch, n, 2) * torch.tensor([width, height]) * 1.2 - 0.1 * torch.tensor([width, height])
     sigma = 0.6 * math.sqrt(height * width / max(n, 1)) + 0.3
     cholesky = sigma * (uniform(batch, n, 3) + torch.tensor([0.3, -0.5, 0.3]))
-    index, membership = None, None
+    index, table = None, None
     if regions > 1:
         y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
         labels = ((x > width // 2) + 2 * (y > height // 2)) % regions
         labels = torch.stack([labels.roll(3 * i, 1) for i in range(maps)]).to(DEVICE)
         widths, width_index = find_widths(labels.int(), regions, softness)
-        membership = Membership(labels, torch.arange(regions, device=DEVICE), blurs_of(widths, DEVICE), width_index)
+        table = with_positions(MapTable(labels, blurs_of(widths, DEVICE), width_index))
         index = torch.randint(-1, regions, (batch, n), generator=generator).to(DEVICE)
     arrays = (t.to(DEVICE) for t in (means, cholesky, uniform(batch, n, channels) - 0.3))
-    return SplatInputs(*arrays, index, membership, size, cutoff)
+    return SplatInputs(*arrays, index, table, size, cutoff)
 
 
 def with_ids(inputs: SplatInputs) -> SplatInputs:
     """Return the same with ids, 5, 8, 11 ..., and 7 where there is no region."""
-    if inputs.region_index is None or inputs.membership is None:
+    if inputs.region_index is None or inputs.table is None:
         return inputs
     ids = torch.where(inputs.region_index >= 0, 3 * inputs.region_index + 5, 7)
-    return inputs._replace(region_index=ids, ids=3 * torch.arange(inputs.membership.num_regions, device=DEVICE) + 5)
+    return inputs._replace(region_index=ids, ids=3 * torch.arange(inputs.table.num_regions, device=DEVICE) + 5)
 
 
 def probe(inputs: SplatInputs) -> Tensor:
@@ -273,7 +273,7 @@ def test_operator() -> None:
     inputs = make_inputs(4, size=(8, 16))
     labels = (torch.arange(16, device=DEVICE) // 9).expand(8, 16).contiguous()
     ids = torch.tensor([[0, 1, 0, 1]], device=DEVICE)
-    settings = ids, labels, *[None] * 7, 8, 16, 0.0
+    settings = ids, *MapTable(labels), 8, 16, 0.0
     backward = torch.ops.kcgs.region_splat_backward.default
     grad = torch.rand(1, 3, 8, 16, device=DEVICE)
     torch.library.opcheck(splat_operator, (*inputs.gaussians, *settings, "cuda"), test_utils="test_schema")

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from kcgs import RegionMap
 from kcgs.functional import region_splat
-from kcgs.maps import Membership, map_operands, membership_at
+from kcgs.maps import Membership, membership_at, table_and_size
 from kcgs.maps.nearest import spread
+from kcgs.maps.table import full_map
 
 Widths = float | dict[tuple[int, int], float]
 PAIRS: dict[tuple[int, int], float] = {(0, 1): 0.7, (1, 2): 2.0, (0, 3): 1.1, (2, 3): 0.7}
@@ -35,16 +36,16 @@ def junction(size: tuple[int, int] = SIZE) -> Tensor:
 
 def weights_of(membership: Membership) -> Tensor:
     """Dense weights of all regions of the first map, (R, H, W)."""
-    return torch.stack([membership.weights(0, r, torch.float64) for r in range(membership.num_regions)])
+    return torch.stack([membership.weights(0, r, torch.float64) for r in range(membership.table.num_regions)])
 
 
 def membership_of(regions: RegionMap) -> Membership:
-    return membership_at(map_operands(regions))
+    return membership_at(*table_and_size(regions))
 
 
 def from_table(membership: Membership, batch: int = 0) -> Tensor:
     """Weights of all regions of one map, put together from the table."""
-    return torch.stack([membership.full_map(batch, region) for region in range(membership.num_regions)])
+    return torch.stack([full_map(membership.tiles, batch, region) for region in range(membership.table.num_regions)])
 
 
 def width_of_pixels(labels: Any, widths: dict[tuple[int, int], float]) -> Any:
@@ -139,7 +140,7 @@ class TestPairWidths:
         labels = (torch.arange(60) // 20).expand(20, 60)  # 0 and 2 do not touch
         regions = RegionMap.from_labels(labels, {(0, 1): 0.7, (1, 2): 0.7, (0, 2): 3.0})
         assert membership_of(regions).widths == (0.7,)
-        table, plain = (membership_of(r).coverage for r in (regions, RegionMap.from_labels(labels, 0.7)))
+        table, plain = (membership_of(r).tiles.tiles for r in (regions, RegionMap.from_labels(labels, 0.7)))
         assert all(torch.equal(a, b) for a, b in zip(table, plain, strict=True))
 
     def test_contours_without_a_width_are_hard(self) -> None:
@@ -156,7 +157,7 @@ class TestPairWidths:
     def test_only_tiles_that_see_a_contour_have_masks(self) -> None:
         labels = torch.zeros(160, 160, dtype=torch.long)
         labels[:, 80:], labels[:, 144:] = 1, 2
-        table = membership_of(RegionMap.from_labels(labels, {(0, 1): 0.7})).coverage
+        table = membership_of(RegionMap.from_labels(labels, {(0, 1): 0.7})).tiles
         assert len(table.weights) == 2 * 20
         # between 1 and 2 no pixel is soft, and their contour is a border of tiles
         assert (table.planes < 0).sum() == 80
@@ -164,7 +165,7 @@ class TestPairWidths:
 
 def test_to(device: torch.device) -> None:
     regions = RegionMap.from_labels(blobs(), PAIRS)
-    moved, expected = membership_of(regions.to(device)).coverage, membership_of(regions).coverage
+    moved, expected = (membership_of(r).tiles.tiles for r in (regions.to(device), regions))
     assert all(a.device.type == device.type and torch.equal(a.cpu(), b) for a, b in zip(moved, expected, strict=True))
 
 

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
 from kcgs.functional import PairSoftness, edge_band, lookup_regions, region_splat
-from kcgs.maps import Membership, map_operands, membership_at
+from kcgs.maps import Membership, membership_at, table_and_size
+from kcgs.maps.table import full_map
 from tests.tester import BaseTester
 
 
@@ -117,7 +118,7 @@ class TestRegionMap(
         regions = RegionMap(blobs(), 0.7)
         monkeypatch.setattr("kcgs.maps.regions._MOST_PLANES", 1)
         noise = RegionMap(blobs(), 0.7)
-        assert map_operands(regions).weights is not None and map_operands(noise).weights is None
+        assert table_and_size(regions)[0].weights is not None and table_and_size(noise)[0].weights is None
         field = GaussianField.random(20, (45, 70), regions=regions, seed=0)
         for size in ((45, 70), (60, 70)):
             assert torch.equal(Scene(field, noise).render(size), Scene(field, regions).render(size))
@@ -169,7 +170,7 @@ class TestPairSoftness:
             assert other.softness == regions.softness and other.resize((44, 70)) is other
             assert other.size == other.labels.shape == (44, 70) and other.index.shape == (1, 44, 70)
         assert others[2].labels.device.type == "meta"
-        assert torch.equal(membership_of(others[0]).coverage.weights, membership_of(regions).coverage.weights)
+        assert torch.equal(membership_of(others[0]).tiles.weights, membership_of(regions).tiles.weights)
 
     @pytest.mark.parametrize(
         ("softness", "error", "words"),
@@ -192,7 +193,7 @@ class TestPairSoftness:
 
 
 def membership_of(regions: RegionMap) -> Membership:
-    return membership_at(map_operands(regions))
+    return membership_at(*table_and_size(regions))
 
 
 def stated_antialiasing(labels: Tensor, x: int, y: int) -> tuple[int, float]:
@@ -302,7 +303,7 @@ class TestResize:
         regions = RegionMap.from_labels(labels, softness)
         resized = regions.resize(size)
         expected = stated_membership(labels, membership_of(regions).variances[0].sqrt(), size)
-        found = torch.stack([membership_of(resized).full_map(0, region) for region in range(3)])
+        found = torch.stack([full_map(membership_of(resized).tiles, 0, region) for region in range(3)])
         assert (found - expected).abs().max() < 1e-6
         for region in range(3):
             weights = membership_of(resized).weights(0, region, torch.float64)
@@ -356,9 +357,9 @@ class TestResize:
     def test_copies_and_parts(self) -> None:
         regions = RegionMap.from_labels(torch.stack([blobs(seed=0), blobs(seed=1)]), 0.7)
         large = regions.resize((90, 140))
-        weights = membership_of(large).coverage.weights
+        weights = membership_of(large).tiles.weights
         for other in (pickle.loads(pickle.dumps(large)), copy.deepcopy(large), RegionMap.from_state(large.state())):
-            assert torch.equal(membership_of(other).coverage.weights, weights)
+            assert torch.equal(membership_of(other).tiles.weights, weights)
         expected = membership_of(large).weights(1, 2, torch.float64)
         torch.testing.assert_close(large[1].membership(2), expected, rtol=0, atol=1e-7)
 

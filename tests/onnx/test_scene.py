@@ -15,7 +15,7 @@ from torch import Tensor
 
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
 from kcgs.functional import region_splat
-from kcgs.maps import map_operands, membership_at
+from kcgs.maps import membership_at, table_and_size
 from kcgs.onnx import describe_decoder, plan, scene_decoder
 
 SIZE = (37, 53)
@@ -222,7 +222,7 @@ class TestInteractive:
         scene = with_regions(kind, 60, size, 5)
         field, regions = scene.field, scene.regions
         assert regions is not None and field.region_ids is not None
-        shares = [membership_at(map_operands(regions)).weights(0, r, torch.float64) for r in range(5)]
+        shares = [membership_at(*table_and_size(regions)).weights(0, r, torch.float64) for r in range(5)]
         shares = [torch.nn.functional.pad(s[None, None], (pad,) * 4, mode="replicate")[0, 0] for s in shares]
         padded = shares[0].shape
         moved = (field.means.detach() + pad, field.cholesky.detach(), field.colors.detach())

@@ -15,7 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from kcgs import GaussianField, RegionMap, Scene
 from kcgs.functional import region_splat
 from kcgs.functional.decomposition import decompose
-from kcgs.maps import map_operands
+from kcgs.maps import MapTable, table_and_size
 
 SIZE = (40, 56)
 PAIRS = {(0, 3): 1.1, (0, 7): 0.0, (3, 7): 2.0}
@@ -59,14 +59,14 @@ class TestDecomposition:
     @pytest.mark.parametrize("softness", [0.0, 0.7, PAIRS, {(0, 3): 1.0}])
     def test_maps(self, softness: Any, size: tuple[int, int]) -> None:
         regions = RegionMap.from_labels(labels_of(SIZE), softness)
-        args = (*gaussians(2, 30, size), *map_operands(regions)[:-1], *size, 1e-4, "reference")
+        args = (*gaussians(2, 30, size), *table_and_size(regions)[0], *size, 1e-4, "reference")
         assert_close(decompose(*args), torch.ops.kcgs.region_splat(*args))
 
     @pytest.mark.parametrize("cutoff", [0.0, 1e-2])
     @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
     def test_without_a_map(self, cutoff: float, dtype: torch.dtype) -> None:
         tensors = [t.to(dtype) for t in gaussians(2, 30, SIZE)[:3]]
-        args = (*tensors, *[None] * 9, *SIZE, cutoff, "reference")
+        args = (*tensors, *[None] * (1 + len(MapTable._fields)), *SIZE, cutoff, "reference")
         assert decompose(*args).dtype == dtype
         assert_close(decompose(*args), torch.ops.kcgs.region_splat(*args))
 
@@ -74,11 +74,11 @@ class TestDecomposition:
         labels = torch.stack([labels_of(SIZE), labels_of(SIZE).flip(1)]) << 40
         tensors = gaussians(2, 30, SIZE)
         tensors[3] <<= 40
-        args = (*tensors, labels, *[None] * 7, *SIZE, 1e-4, "reference")
+        args = (*tensors, *MapTable(labels), *SIZE, 1e-4, "reference")
         assert_close(decompose(*args), torch.ops.kcgs.region_splat(*args))
 
     def test_no_gaussians(self) -> None:
-        args = (*gaussians(1, 0, SIZE), labels_of(SIZE), *[None] * 7, *SIZE, 1e-4, "reference")
+        args = (*gaussians(1, 0, SIZE), *MapTable(labels_of(SIZE)), *SIZE, 1e-4, "reference")
         assert torch.equal(decompose(*args), torch.zeros(1, 3, *SIZE))
 
     def test_many_pairs(self) -> None:
@@ -94,7 +94,7 @@ class TestDecomposition:
             3 * cholesky,
             colors,
             torch.arange(40)[None],
-            *map_operands(regions)[:-1],
+            *table_and_size(regions)[0],
             24,
             36,
             1e-4,
@@ -118,7 +118,7 @@ class TestDecomposition:
         size, largest = (96, 128), Largest()
         tensors = gaussians(1, 400, size)
         with largest:
-            decompose(*tensors, labels_of(size), *[None] * 7, *size, 1e-4, "tiled")
+            decompose(*tensors, *MapTable(labels_of(size)), *size, 1e-4, "tiled")
         assert largest.numel == 64 * 32 * 32 > 3 * 96 * 128
 
     def test_compilers_and_torch_export_keep_the_operator(self, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,7 @@ from torch.utils.checkpoint import checkpoint
 
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
 from kcgs.functional import lookup_regions, region_splat
-from kcgs.maps import map_operands
+from kcgs.maps import table_and_size
 
 SIZE = (24, 32)
 
@@ -245,7 +245,7 @@ class TestOperator:
     @pytest.mark.parametrize("kernel", ["cpu", "tiled", "reference"])
     def test_opcheck(self, field: GaussianField, regions: RegionMap, kernel: str) -> None:
         gaussians = [t.detach()[None].clone().requires_grad_() for t in (field.means, field.cholesky, field.colors)]
-        settings = (field.region_ids[None], *map_operands(regions)[:-1], *SIZE, 1e-4, kernel)
+        settings = (field.region_ids[None], *table_and_size(regions)[0], *SIZE, 1e-4, kernel)
         torch.library.opcheck(torch.ops.kcgs.region_splat.default, (*gaussians, *settings))
         grad = torch.rand(1, 3, *SIZE, requires_grad=kernel == "reference")
         gaussians = gaussians if kernel == "reference" else [t.detach() for t in gaussians]
@@ -323,7 +323,7 @@ class TestOperator:
     ) -> None:
         compiled = torch.compile(RegionSplatRenderer(), backend="aot_eager")
         before = compiled(field, regions)
-        monkeypatch.setattr("kcgs.maps.membership.Membership._make_coverage", None)
+        monkeypatch.setattr("kcgs.maps.tiles._list_entries", None)
         assert torch.equal(compiled(field, regions), before)
 
     def test_a_pickle_has_no_tables_of_other_sizes(self, field: GaussianField, regions: RegionMap) -> None:

@@ -10,17 +10,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.weak import WeakTensorKeyDictionary
 
 from kcgs.compiled import Workspace, borrowed
 from kcgs.compiled.tasks import chunks, phases, run_tasks
-from kcgs.maps import Membership
+from kcgs.maps import MapTable, derive, table_at
 
 from ..coarse_grids import make_blocks, max_spacing
+from ..grid_columns import TILE_COLS, TILE_ROWS
 from ..interface import Gradients, Kernel, SplatInputs
 from ..whitened import least_exponent, support_radius
 from .gradients import Backward
-from .layout import COLUMNS, PAIR_COLUMNS, PREFETCH_DISTANCE, SHAPE_COLUMNS, TILE_COLS, TILE_ROWS, Batch, Lists, Table
+from .layout import COLUMNS, PAIR_COLUMNS, PREFETCH_DISTANCE, SHAPE_COLUMNS, Batch, Lists, TileTable
 from .lists import arrange, list_pairs, measure
 from .loops import sum_rows
 from .schedule import ADDS, GATHERS, order_tasks
@@ -56,8 +56,8 @@ def kernel_for(inputs: SplatInputs) -> Kernel:
 def plan(inputs: SplatInputs) -> CpuPlan | None:
     """List which Gaussians touch which blocks; None where a value is out of range."""
     means, cholesky, colors = (_array(t) for t in inputs.gaussians)
-    if inputs.membership is not None and inputs.region_index is not None:
-        table = _table_of(inputs.membership)
+    if inputs.table is not None and inputs.region_index is not None:
+        table = derive(table_at(inputs.table, inputs.size), _table_of)
         regions = inputs.region_index.flatten().numpy()
     else:
         table, regions = _table_without_map(inputs.size), np.empty(0, np.int64)
@@ -66,7 +66,7 @@ def plan(inputs: SplatInputs) -> CpuPlan | None:
     return _list_pairs(batch, table, order, inputs.cutoff) if is_valid else None
 
 
-def _list_pairs(batch: Batch, table: Table, order: Any, cutoff: float) -> CpuPlan:
+def _list_pairs(batch: Batch, table: TileTable, order: Any, cutoff: float) -> CpuPlan:
     radius, least = support_radius(cutoff, torch.float32), least_exponent(cutoff, torch.float32)
     count, blocks = len(order), len(table.parents)
     copies = batch.num_images if table.num_maps == 1 else 1
@@ -108,32 +108,24 @@ def _array(tensor: Tensor) -> Any:
     return tensor.detach().resolve_neg().reshape(-1, tensor.shape[-1]).contiguous().numpy()
 
 
-# of RegionMaps, by a tensor of the coverage that a table does not hold
-_tables: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
-
-
-def _table_of(membership: Membership) -> Table:
-    starts, regions, planes, weights = membership.coverage
-    table: Table | None = _tables.get(starts)
-    if table is None:
-        shape = tuple(membership.labels.shape)
-        arrays = starts.numpy(), regions.numpy(), planes.long().numpy(), weights.flatten().numpy()
-        table = _table(*arrays, membership.num_regions, shape)
-        _tables[starts] = table
-    return table
+def _table_of(table: MapTable) -> TileTable:
+    starts, regions, planes, weights = (part.numpy() for part in table.tiles)
+    return _make_table(starts, regions, planes.astype(np.int64), weights.ravel(), table.num_regions, table.shape)
 
 
 # contour moves render each region alone, in the size of its box
 @functools.lru_cache(maxsize=256)
-def _table_without_map(size: tuple[int, int]) -> Table:
+def _table_without_map(size: tuple[int, int]) -> TileTable:
     tiles = -(-size[0] // SIDE) * -(-size[1] // SIDE)
     starts, regions = np.arange(tiles + 1), np.zeros(tiles, np.int64)
-    return _table(starts, regions, np.full(tiles, -1), np.zeros(1, np.float32), 1, (1, *size))
+    return _make_table(starts, regions, np.full(tiles, -1), np.zeros(1, np.float32), 1, (1, *size))
 
 
-def _table(starts: Any, regions: Any, planes: Any, masks: Any, num_regions: int, shape: tuple[int, ...]) -> Table:
+def _make_table(
+    starts: Any, regions: Any, planes: Any, masks: Any, num_regions: int, shape: tuple[int, ...]
+) -> TileTable:
     grids, tile_start, regions, parents, parity = make_blocks(starts, regions, num_regions, shape)
-    return Table(num_regions, shape[0], np.array(grids), regions, tile_start, parents, parity, planes, masks)
+    return TileTable(num_regions, shape[0], np.array(grids), regions, tile_start, parents, parity, planes, masks)
 
 
 def render(plan: CpuPlan, inputs: SplatInputs) -> Tensor:

@@ -25,13 +25,6 @@ COLOR_FACTOR = 12  # of its colours, where a spline widens it
 CHANGE = 13  # c - 1, where c is the ratio of a weight's ratios between rows, see rows.py
 COLUMNS = 14
 
-# columns of Table.grids
-NODE_ROWS = 0
-NODE_COLS = 1
-TILE_ROWS = 2
-TILE_COLS = 3
-FIRST_TILE = 4  # number of its first tile, through all levels
-
 # columns of Lists.pairs
 GAUSSIAN = 0
 TERMS = 1  # place of its sums
@@ -45,12 +38,12 @@ PREFETCH_DISTANCE = 4  # pairs from a shape that is fetched to the present one, 
 SHAPE_COLUMNS = 7
 
 
-class Table(NamedTuple):
+class TileTable(NamedTuple):
     """The regions of each tile and block, from a label map, or of one region everywhere."""
 
     num_regions: int
     num_maps: int  # 1, or as many as images
-    grids: Any  # [levels, 5] int64
+    grids: Any  # [levels, 5] int64, see `coarse_grids.Grid`
     regions: Any  # [K] int64, region of each block, in the order of tiles
     tile_start: Any  # [tiles + 1] int64 into blocks, all levels
     parents: Any  # [K, 4] int64, blocks of the next level that each is refined from; K: none
@@ -83,6 +76,6 @@ class Lists(NamedTuple):
     shapes: Any  # [P, 7] float32, the Gaussian in the block, see ellipse.enter; in the order of sums
     first_terms: Any  # [N + 1] int64, place of each Gaussian's first sums
     num_terms: Any  # [N] int32, blocks that each Gaussian touches
-    table: Table
+    table: TileTable
     live: Any  # [copies * (blocks of nodes + 1)] bool: not all zero; the last block of a copy never is
     cutoff: Any  # float32, weight below which it is zero

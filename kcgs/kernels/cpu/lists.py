@@ -9,6 +9,7 @@ import numpy as np
 from kcgs.compiled.program import inline, inner
 from kcgs.compiled.tasks import first_task, next_task
 
+from ..grid_columns import FIRST_TILE, NODE_COLS, NODE_ROWS, TILE_COLS, TILE_ROWS
 from ..whitened import MEAN_LIMIT, SCALE, SCALE_LIMITS
 from .ellipse import block_rows, bounded, enter, row_halves, tile_rows
 from .layout import (
@@ -17,7 +18,6 @@ from .layout import (
     END_HALF,
     FIRST,
     FIRST_HALF,
-    FIRST_TILE,
     GAUSSIAN,
     INVERSE_L11,
     L11,
@@ -27,8 +27,6 @@ from .layout import (
     LEVEL,
     MEAN_X,
     MEAN_Y,
-    NODE_COLS,
-    NODE_ROWS,
     PEAK,
     RUN,
     SIGMA_Y,
@@ -36,8 +34,6 @@ from .layout import (
     SLOPE2_X,
     SLOPE2_Y,
     TERMS,
-    TILE_COLS,
-    TILE_ROWS,
     program,
 )
 from .simd import HALVES, SIDE
@@ -94,7 +90,7 @@ def measure(batch, table, radius, spacing, order, gaussians, colors, spans, coun
 
     Args:
         batch: Batch.
-        table: Table.
+        table: TileTable.
         radius: the largest |z| of a weight.
         spacing: of nodes in standard deviations, see coarse_grids.
         order: see Lists.
@@ -265,7 +261,7 @@ def _coarsen(g, spacing, levels):  # type: ignore[no-untyped-def]
 
 @inline
 def find_block(num_regions, tile_start, regions, tile, region):  # type: ignore[no-untyped-def]
-    """Return the position of a region's block in a tile, or -1; takes arrays, since to pass on a Table is slow."""
+    """Return the position of a region's block in a tile, or -1; takes arrays, since to pass on a TileTable is slow."""
     if num_regions == 1:
         return tile
     low, high = tile_start[tile], tile_start[tile + 1]

@@ -16,8 +16,9 @@ import numpy as np
 from kcgs.compiled.program import inline_once, inner
 from kcgs.compiled.tasks import first_task, next_task
 
+from ..grid_columns import TILE_COLS
 from .gradients import sum_terms
-from .layout import TILE_COLS, program
+from .layout import program
 from .lists import first_head, first_node_block, first_tile
 from .rows import add_rows, gather_rows
 from .schedule import ADDS, CLEARS, FIRST_FIELD, GATHERS, IMAGE, KIND, LEVEL_FIELD, ROW, SUMS

@@ -15,7 +15,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from kcgs.maps import TILE
+from kcgs.maps import TILE, table_at
 
 from ..interface import SplatInputs
 from ..tiles import MARGIN, RELATIVE_MARGIN, TileGrid, grid_of
@@ -63,7 +63,7 @@ class CudaPlan(NamedTuple):
     slots: Tensor  # [4, S] int32: entries of cells; Gaussians of pairs, and their planes; pairs of slots, -1: none
     coefficients: Tensor  # [S, 5] float32, of pairs: see tiles.coefficients, times SCALE
     pieces: Tensor  # [2, P] int32: a tile, and the first of up to 8 of its pairs
-    weights: Tensor | None  # of the map's coverage
+    weights: Tensor | None  # of the map's tiles
     grid: TileGrid
     num_cells: int
     foreign: int  # Gaussians whose region id the map does not hold, where the plan waited for the device
@@ -87,11 +87,10 @@ def plan(inputs: SplatInputs) -> CudaPlan | None:
     waits = room is None
     counters = torch.zeros(_COUNTERS, dtype=torch.int64, device=device)
     gaussians = torch.empty(4, total, dtype=torch.int32, device=device)
-    ids, coverage = inputs.ids, inputs.coverage
-    num_ids, map_tiles, starts, regions, planes, weights = 0, 1, None, None, None, None
-    if ids is not None and coverage is not None:
-        num_ids, map_tiles = len(ids), len(coverage.starts) - 1
-        starts, regions, planes, weights = coverage
+    ids, num_ids, map_tiles, starts, regions, planes, weights = inputs.ids, 0, 1, None, None, None, None
+    if ids is not None and inputs.table is not None:
+        starts, regions, planes, weights = table_at(inputs.table, inputs.size).tiles
+        num_ids, map_tiles = len(ids), len(starts) - 1
     with torch.cuda.device_of(means):
         _prepare(
             (-(-total // _PREPARE_BLOCK),),

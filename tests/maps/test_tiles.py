@@ -1,4 +1,4 @@
-"""Coverage against the definition of membership: regions of tiles, and weights of their pixels."""
+"""Tiles against the definition of membership: regions of tiles, and weights of their pixels."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ import torch
 from torch import Tensor
 
 from kcgs import RegionMap
-from kcgs.maps import ContourWidths, Coverage, Membership, find_widths, make_coverage
-from kcgs.maps.widths import blurs_of, search_widths
+from kcgs.maps import MapTable, Membership
+from kcgs.maps.device_tiles import tiles_on_device
+from kcgs.maps.widths import ContourWidths, blurs_of, find_widths, search_widths
 
 TILE = 16
 Widths = float | dict[tuple[int, int], float]
+Tiles = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 def random_labels(*shape: int, regions: int, grain: int = 1, seed: int = 0) -> Tensor:
@@ -52,16 +54,17 @@ MAPS: dict[str, Tensor] = {
 def membership_of(labels: Tensor, softness: Widths) -> Membership:
     index, count = labels.int(), int(labels.max()) + 1
     widths, width_index = find_widths(index, count, softness)
-    return Membership(index, torch.arange(count, device=labels.device), blurs_of(widths, labels.device), width_index)
+    ids, blurs = torch.arange(count, device=labels.device), blurs_of(widths, labels.device)
+    return Membership(MapTable(labels, blurs, width_index, ids, index))
 
 
 @pytest.fixture(params=["torch", "compiled"])
-def coverage_of(request: pytest.FixtureRequest) -> Callable[[Membership], Coverage]:
-    """The table as any device makes it, and as the CPU does."""
+def tiles_of(request: pytest.FixtureRequest) -> Callable[[Membership], Tiles]:
+    """The tiles as any device makes them, and as the CPU does."""
     if request.param == "compiled":
-        return lambda membership: membership.coverage
-    return lambda membership: make_coverage(
-        membership.index, membership.num_regions, membership.widths, membership.width_index
+        return lambda membership: membership.tiles.tiles
+    return lambda membership: tiles_on_device(
+        membership.index, membership.table.num_regions, membership.widths, membership.table.width_index
     )
 
 
@@ -71,53 +74,51 @@ def tile_slices(shape: torch.Size) -> list[tuple[int, slice, slice]]:
     return [(b, slice(y, min(y + TILE, height)), slice(x, min(x + TILE, width))) for b, y, x in corners]
 
 
-def check(coverage: Coverage, membership: Membership, contours: ContourWidths | None = None) -> None:
+def check(result: Tiles, membership: Membership, contours: ContourWidths | None = None) -> None:
     """Compare with regions that are looked for pixel by pixel, and with dense weights."""
-    index, (widths, width_index) = membership.index, contours or (membership.widths, membership.width_index)
-    oracle = [
-        torch.stack([membership.weights(b, r, torch.float64) for r in range(membership.num_regions)])
-        for b in range(len(index))
-    ]
+    index, count = membership.index, membership.table.num_regions
+    widths, width_index = contours or (membership.widths, membership.table.width_index)
+    oracle = [torch.stack([membership.weights(b, r, torch.float64) for r in range(count)]) for b in range(len(index))]
     tiles = tile_slices(index.shape)
-    assert [part.dtype for part in coverage] == [torch.int32] * 3 + [torch.float32]
-    starts, planes = coverage.starts.tolist(), coverage.planes.tolist()
-    assert starts[0] == 0 and len(starts) == len(tiles) + 1 and starts[-1] == len(coverage.regions)
-    assert [plane for plane in planes if plane >= 0] == list(range(len(coverage.weights)))
+    assert [part.dtype for part in result] == [torch.int32] * 3 + [torch.float32]
+    starts, regions_of_tiles, planes, weights = result[0].tolist(), result[1], result[2].tolist(), result[3]
+    assert starts[0] == 0 and len(starts) == len(tiles) + 1 and starts[-1] == len(regions_of_tiles)
+    assert [plane for plane in planes if plane >= 0] == list(range(len(weights)))
     for (b, rows, cols), first, end in zip(tiles, starts[:-1], starts[1:], strict=True):
         reach = math.ceil(4 * widths[0 if width_index is None else int(width_index[b, rows, cols].max())])
         around = [slice(max(s.start - reach, 0), s.start + TILE + reach) for s in (rows, cols)]
         regions = index[b, around[0], around[1]].unique()
-        assert torch.equal(coverage.regions[first:end].long(), regions.long())
+        assert torch.equal(regions_of_tiles[first:end].long(), regions.long())
         is_alone = len(regions) == 1
         assert all((plane < 0) == is_alone for plane in planes[first:end])
-        expected = torch.zeros(membership.num_regions, TILE, TILE)
-        expected[regions.long()] = 1.0 if is_alone else coverage.weights[planes[first:end]].view(-1, TILE, TILE)
+        expected = torch.zeros(count, TILE, TILE)
+        expected[regions.long()] = 1.0 if is_alone else weights[planes[first:end]].view(-1, TILE, TILE)
         dense = oracle[b][:, rows, cols]
         assert (expected[:, : dense.shape[1], : dense.shape[2]] - dense).abs().max() < 1e-6
 
 
 @pytest.mark.parametrize("softness", [0.0, 0.7, 3.0])
 @pytest.mark.parametrize("name", MAPS)
-def test_one_width(name: str, softness: float, coverage_of: Callable[[Membership], Coverage]) -> None:
+def test_one_width(name: str, softness: float, tiles_of: Callable[[Membership], Tiles]) -> None:
     membership = membership_of(MAPS[name], softness)
-    check(coverage_of(membership), membership)
+    check(tiles_of(membership), membership)
 
 
 @pytest.mark.parametrize("name", ["one row", "eight in a tile", "batch", "pixels"])
-def test_widths_of_pairs(name: str, coverage_of: Callable[[Membership], Coverage]) -> None:
+def test_widths_of_pairs(name: str, tiles_of: Callable[[Membership], Tiles]) -> None:
     softness = pairs(int(MAPS[name].max()) + 1, [0.7, 0.0, 2.2, 1.1])
     membership = membership_of(MAPS[name], softness)
-    assert membership.width_index is not None
-    check(coverage_of(membership), membership)
+    assert membership.table.width_index is not None
+    check(tiles_of(membership), membership)
 
 
 @pytest.mark.parametrize("softness", [64.0, pairs(5, [64.0, 0.5, 20.0])])
 def test_wide_contours(
-    softness: Widths, coverage_of: Callable[[Membership], Coverage], monkeypatch: pytest.MonkeyPatch
+    softness: Widths, tiles_of: Callable[[Membership], Tiles], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("kcgs.maps.coverage._CHUNK_BYTES", 1 << 24)  # of many parts
+    monkeypatch.setattr("kcgs.maps.device_tiles._CHUNK_BYTES", 1 << 24)  # of many parts
     membership = membership_of(random_labels(1, 50, 70, regions=5, grain=17), softness)
-    check(coverage_of(membership), membership)
+    check(tiles_of(membership), membership)
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (1, 1, 60), (2, 40, 55), (1, 90, 3)])
@@ -127,8 +128,8 @@ def test_widths_of_pixels(shape: tuple[int, int, int], values: list[float]) -> N
     labels = random_labels(*shape, regions=6, grain=7)
     membership = membership_of(labels, pairs(6, values))
     contours = search_widths(membership.index, 6, pairs(6, values))
-    check(make_coverage(membership.index, 6, *contours), membership, contours)
-    widths, level = membership.widths, membership.width_index
+    check(tiles_on_device(membership.index, 6, *contours), membership, contours)
+    widths, level = membership.widths, membership.table.width_index
     pixels, expected = (
         torch.full(shape, w[0]) if i is None else torch.tensor(w)[i.long()] for w, i in (contours, (widths, level))
     )
@@ -143,9 +144,9 @@ def test_widths_of_pixels(shape: tuple[int, int, int], values: list[float]) -> N
 @pytest.mark.parametrize("softness", [0.0, 0.7, pairs(4, [0.5, 0.0, 2.0])])
 def test_devices_agree(softness: Widths, device: torch.device) -> None:
     membership, moved = (membership_of(MAPS["batch"].to(d), softness) for d in ("cpu", device))
-    coverage, pixels = moved.coverage, moved.width_index
+    tiles, pixels = moved.tiles.tiles, moved.table.width_index
     contours = ContourWidths(moved.widths, None if pixels is None else pixels.cpu())
-    check(Coverage(*(part.cpu() for part in coverage)), membership, contours)
+    check(tuple(part.cpu() for part in tiles), membership, contours)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

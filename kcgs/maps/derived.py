@@ -1,0 +1,63 @@
+"""What is made of a map's table when it is first needed: the map at other sizes, and a kernel's arrays.
+
+The rule: it is kept as long as a RegionMap keeps the table, so it must not hold the table's `starts`. What is made of
+labels alone is not kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from torch.utils.weak import WeakTensorKeyDictionary
+
+from .membership import Membership
+from .resampled import Resampled, SmoothMembership
+from .table import MapTable, with_positions
+from .tiles import complete
+
+T = TypeVar("T")
+
+_KEPT_SIZES = 3  # of a map: a viewer renders at ever new sizes
+
+# by the `starts` of a table: what functions have made of it, by the function
+_derived: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
+
+
+def derive(table: MapTable, make: Callable[[MapTable], T]) -> T:
+    """Return what a function makes of a table, which it is called for once."""
+    if table.starts is None:
+        return make(table)
+    results: dict[Any, Any] | None = _derived.get(table.starts)
+    if results is None:
+        _derived[table.starts] = results = {}
+    if make not in results:
+        results[make] = make(table)
+    result: T = results[make]
+    return result
+
+
+class _Sizes:
+    """The memberships of a map at other sizes than its own, those added last."""
+
+    def __init__(self, table: MapTable) -> None:
+        self._smooth = SmoothMembership(Membership(table.without_tiles()))
+        self._sizes: dict[tuple[int, int], Resampled] = {}
+
+    def at(self, size: tuple[int, int]) -> Resampled:
+        sizes = self._sizes
+        if size not in sizes:
+            # a new dict: another thread may read the present one
+            self._sizes = sizes = dict([*sizes.items(), (size, Resampled(self._smooth, size))][-_KEPT_SIZES:])
+        return sizes[size]
+
+
+def membership_at(table: MapTable, size: tuple[int, int]) -> Membership:
+    """Return the membership of a map at a size, by its definition."""
+    table = with_positions(table)
+    return Membership(table) if size == table.size else derive(table, _Sizes).at(size)
+
+
+def table_at(table: MapTable, size: tuple[int, int]) -> MapTable:
+    """Return the table of a map at a size, with all that kernels read."""
+    return complete(table) if size == table.size else membership_at(table, size).tiles
