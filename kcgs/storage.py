@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_count
-from kcgs.functional import PairSoftness, RegionMap
+from kcgs.functional import RegionMap
+from kcgs.maps import softness_from_plain, softness_to_plain
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
@@ -46,9 +47,7 @@ def serialize(scene: Scene) -> bytes:
     if field.region_ids is not None:
         tensors["region_ids"] = _narrow(field.region_ids.cpu())
     if regions is not None:
-        header["softness"] = softness = regions.softness
-        if isinstance(softness, PairSoftness):
-            header["softness"] = [[*pair, width] for pair, width in softness.items()]
+        header["softness"] = softness_to_plain(regions.softness)
         labels = _narrow(regions.labels.cpu()).numpy()
         header["labels"] = {"dtype": labels.dtype.name, "shape": labels.shape}
         tensors["labels"] = torch.frombuffer(bytearray(_deflate(labels)), dtype=torch.uint8)
@@ -92,9 +91,7 @@ def _assemble(tensors: dict[str, Tensor], header: Any) -> Scene:
     field = GaussianField(means, cholesky, colors, ids, tensors.get("opacities"), size=size)
     regions = None
     if "labels" in tensors:
-        softness = header["softness"]
-        if isinstance(softness, list):
-            softness = {(low, high): value for low, high, value in softness}
+        softness = softness_from_plain(header["softness"])
         regions = RegionMap.from_labels(_inflate(tensors["labels"], **header["labels"]), softness)
     return Scene(field, regions, header["notes"])
 

@@ -116,15 +116,15 @@ def info(scene: SceneFile, as_json: Json = False) -> None:
 
     loaded = load(scene)
     softness = 0.0 if loaded.regions is None else loaded.regions.softness
-    if not isinstance(softness, float):
-        softness = sum(softness.values()) / max(1, len(softness))
+    parts = softness if isinstance(softness, tuple) else (softness,)
+    means = [part if isinstance(part, float) else sum(part.values()) / max(1, len(part)) for part in parts]
     report: dict[str, Any] = {
         "images": loaded.field.means.shape[:-2].numel(),
         **describe_scene(loaded),
         "channels": loaded.field.colors.shape[-1],
         "height": loaded.size[0],
         "width": loaded.size[1],
-        "softness": softness,
+        "softness": sum(means) / len(means),
         **describe_file(scene, scene.stat().st_size, loaded.size),
         **{f"metadata.{key}": value for key, value in loaded.metadata.items()},
     }

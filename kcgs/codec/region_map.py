@@ -32,6 +32,7 @@ def encode_region_map(regions: RegionMap) -> bytes:
     ids, index = compact(regions.labels.cpu())[:2]
     labels = encode_stream(ids.numpy(), index.numpy(), is_file=False)
     softness = regions.softness
+    assert not isinstance(softness, tuple)  # of one map
     if isinstance(softness, PairSoftness):
         units = [_round(softness.get(pair, 0.0)) for pair in sorted(touching_pairs(regions.labels))]
     else:

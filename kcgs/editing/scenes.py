@@ -98,6 +98,7 @@ def move_region(scene: Scene, region_ids: int | Iterable[int], offset: Sequence[
 def _contour_reach(regions: RegionMap) -> int:
     """Return the distance from a contour, in pixels, within which one sees what is behind a region."""
     softness = regions.softness
+    assert not isinstance(softness, tuple)  # of one map
     largest = softness if isinstance(softness, float) else max(softness.values(), default=0.0)
     return math.ceil(1.0 + _CONTOUR_SIGMAS * largest)
 

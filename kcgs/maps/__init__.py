@@ -18,7 +18,7 @@ from .membership import Membership
 from .region_graph import Labels, RegionGraph, merge_nearest, pairs_to_merge
 from .regions import RegionMap, wrap_labels
 from .resampled import LEAST_BLUR, PIXEL, Resampled, SmoothMembership, cut_windows, find_windows, sharpness
-from .softness import MAX_SOFTNESS, PairSoftness
+from .softness import MAX_SOFTNESS, PairSoftness, softness_from_plain, softness_to_plain
 from .table import PER_MAP, SHARED, TILE, MapTable, with_positions
 from .widths import RADIUS_SIGMAS, truncated_gaussian
 
@@ -27,6 +27,7 @@ __all__ = [
     "Membership", "PairSoftness", "RegionGraph", "RegionMap", "Resampled", "SmoothMembership", "antialias",
     "as_region_map", "compact", "contour_edges", "cut_windows", "derive", "edge_band", "find_windows",
     "interior_points", "lookup_regions", "membership_at", "merge_nearest", "pairs_to_merge", "pixels_under",
-    "positions_of", "sharpness", "shifted", "table_and_size", "table_at", "touching_pairs", "truncated_gaussian",
+    "positions_of", "sharpness", "shifted", "softness_from_plain", "softness_to_plain",
+    "table_and_size", "table_at", "touching_pairs", "truncated_gaussian",
     "unique_pairs", "with_positions", "wrap_labels",
 ]  # fmt: skip

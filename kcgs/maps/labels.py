@@ -121,12 +121,14 @@ def contour_edges(labels: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def touching_pairs(labels: Tensor) -> set[tuple[int, int]]:
-    r"""Find the pairs of regions, the lower id first, that share a pixel side in a map as of :func:`contour_edges`.
+    r"""Find the pairs of regions, the lower id first, that share a pixel side in a map, or in any of a batch.
 
     Example:
         >>> touching_pairs(torch.tensor([[0, 3, 3], [0, 0, 7]])) == {(0, 3), (0, 7), (3, 7)}
         True
     """
+    if labels.ndim == 3:
+        return set().union(*map(touching_pairs, labels))
     pairs: set[tuple[int, int]] = set()
     for rows in row_slices(*labels.shape):
         edges = contour_edges(labels[rows.start : rows.stop + 1])[0]  # with the row below

@@ -12,8 +12,20 @@ from kcgs._check import check_size
 from kcgs._labels import check_labels
 
 from .derived import table_at
-from .labels import compact, positions_of, sample_labels, touching_pairs, union_find
-from .softness import PairSoftness, check_softness, merged_softness, scaled_softness, softness_by_position
+from .labels import compact, positions_of, sample_labels, union_find
+from .softness import (
+    GivenSoftness,
+    Softness,
+    check_softness,
+    extended_softness,
+    for_each,
+    merged_softness,
+    scaled_softness,
+    softness_by_position,
+    softness_from_plain,
+    softness_of_labels,
+    softness_to_plain,
+)
 from .table import MapTable, full_map
 from .tiles import with_tiles
 from .widths import blurs_of, find_widths
@@ -38,12 +50,12 @@ class RegionMap:
     """
 
     _labels: Tensor
-    _softness: float | PairSoftness
+    _softness: Softness
     _index: Tensor  # [maps, H, W] int32
     _table: MapTable  # of the map, or of the one that it was interpolated from
     _source: RegionMap | None  # the map that this one was interpolated from
 
-    def __init__(self, labels: Any, softness: float | Mapping[tuple[int, int], float] = 0.0) -> None:
+    def __init__(self, labels: Any, softness: GivenSoftness = 0.0) -> None:
         r"""Make a map of labels.
 
         Args:
@@ -51,12 +63,12 @@ class RegionMap:
                 :math:`(B, H, W)` or :math:`(B, 1, H, W)`, non-negative; ids need not be consecutive. Or a PIL image, or
                 the path of a file that :func:`kcgs.data.load_labels` reads.
             softness: of contours (standard deviation) in pixels, 0 to 64; or one for each pair of ids in any order, 0
-                for pairs that are not mentioned.
+                for pairs that are not mentioned. For a batch also a list with either for each map.
 
         Raises:
             TypeError: labels are no integers; softness of another type.
-            ValueError: wrong shape, no pixels, negative ids, softness out of range or of ids that are not in the map;
-                a grey image or array with soft edges, for which the message has a threshold.
+            ValueError: wrong shape, no pixels, negative ids, softness out of range, of ids that are not in the map, or
+                of another number of maps; a grey image or array with soft edges, for which the message has a threshold.
 
         Example:
             >>> edge = torch.tensor([[1, 1, 1, 2], [1, 1, 1, 2]])
@@ -66,13 +78,14 @@ class RegionMap:
         with torch.inference_mode(False):  # a graph of autograd keeps no tensor of that mode
             self._fill(check_labels("labels", labels).clone(), softness)
 
-    def _fill(self, labels: Tensor, softness: float | Mapping[tuple[int, int], float]) -> None:
+    def _fill(self, labels: Tensor, softness: GivenSoftness) -> None:
         """Derive all that renders read."""
         self._labels, self._source = labels, None
         ids, index = compact(labels)
         self._index = index if index.ndim == 3 else index[None]
-        self._softness = check_softness(softness, ids)
-        widths, pixels = find_widths(self._index, len(ids), softness_by_position(self._softness, ids))
+        self._softness = check_softness(softness, ids, self._index, labels.ndim == 3)
+        by_position = for_each(self._softness, lambda one: softness_by_position(one, ids))
+        widths, pixels = find_widths(self._index, len(ids), by_position)
         blurs = None if widths == (0.0,) else blurs_of(widths, labels.device)
         self._table = with_tiles(MapTable(labels, blurs, pixels, ids, self._index), _MOST_PLANES)
 
@@ -89,7 +102,7 @@ class RegionMap:
         return f"RegionMap({self.num_regions} regions, size={self.size}, softness={self.softness})"
 
     @classmethod
-    def from_labels(cls, labels: Any, softness: float | Mapping[tuple[int, int], float] = 0.0) -> RegionMap:
+    def from_labels(cls, labels: Any, softness: GivenSoftness = 0.0) -> RegionMap:
         """Return RegionMap(labels, softness)."""
         return cls(labels, softness)
 
@@ -106,8 +119,8 @@ class RegionMap:
         return ids
 
     @property
-    def softness(self) -> float | PairSoftness:
-        """Softness of all contours in pixels, or that of each pair of regions."""
+    def softness(self) -> Softness:
+        """Softness of all contours in pixels, or that of each pair of regions; a tuple where maps of a batch differ."""
         return self._softness
 
     @property
@@ -194,10 +207,9 @@ class RegionMap:
             raise ValueError(f"labels must have shape {tuple(self._labels.shape)}; got {tuple(labels.shape)}")
         if not self._labels.is_cpu:  # a device would be waited for at every step
             return self.to("cpu").relabel(labels.cpu(), new_contours).to(self._labels.device)
-        softness: float | Mapping[tuple[int, int], float] = self.softness
-        if isinstance(softness, PairSoftness) and new_contours == "mean":
-            mean = sum(softness.values()) / len(softness)
-            softness = dict.fromkeys(touching_pairs(labels) - touching_pairs(self._labels), mean) | {**softness}
+        softness: Any = self._softness
+        if new_contours == "mean":
+            softness = for_each(softness, extended_softness, labels, self._labels)
         return self._with_labels(labels, softness)
 
     def merge(self, pairs: Iterable[tuple[int, int]]) -> tuple[RegionMap | None, Tensor]:
@@ -222,7 +234,7 @@ class RegionMap:
         if len(new_ids.unique()) == 1:
             return None, new_ids
         labels = new_ids[self.index_of(self._labels)]
-        return RegionMap(labels, merged_softness(self.softness, merged_id)), new_ids
+        return RegionMap(labels, for_each(self._softness, lambda one: merged_softness(one, merged_id))), new_ids
 
     def to(self, device: torch.device | str) -> RegionMap:
         """Return the map on another device."""
@@ -263,14 +275,13 @@ class RegionMap:
             raise ValueError("an index needs a batch of maps; got one map")
         if self._source is not None:
             return self._source[index].resize(self.size)
-        return self._with_labels(self._labels[index], self.softness)
+        softness = self._softness[index] if isinstance(self._softness, tuple) else self._softness
+        return self._with_labels(self._labels[index], softness)
 
-    def _with_labels(self, labels: Tensor, softness: float | Mapping[tuple[int, int], float]) -> RegionMap:
+    @staticmethod
+    def _with_labels(labels: Tensor, softness: Any) -> RegionMap:
         """Make the map of these labels, without the softness of pairs that they do not have."""
-        if isinstance(softness, Mapping):
-            ids = set(labels.unique().tolist())
-            softness = {pair: value for pair, value in softness.items() if ids.issuperset(pair)}
-        return RegionMap(labels, softness)
+        return RegionMap(labels, for_each(softness, softness_of_labels, labels))
 
     def state(self) -> dict[str, Any]:
         """Return the map as tensors, numbers and tuples, which ``torch.load(weights_only=True)`` reads.
@@ -281,8 +292,7 @@ class RegionMap:
         """
         if self._source is not None:
             return {**self._source.state(), "size": self.size}
-        softness = self.softness if isinstance(self.softness, float) else tuple(self.softness.items())
-        return {"labels": self.labels, "softness": softness, "size": self.size}
+        return {"labels": self.labels, "softness": softness_to_plain(self._softness), "size": self.size}
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> RegionMap:
@@ -292,9 +302,7 @@ class RegionMap:
             >>> RegionMap.from_state(RegionMap(torch.tensor([[1, 2]])).state())
             RegionMap(2 regions, size=(1, 2), softness=0.0)
         """
-        pairs = state["softness"]
-        softness = pairs if isinstance(pairs, float) else {tuple(pair): value for pair, value in pairs}
-        return cls.from_labels(state["labels"], softness).resize(state["size"])
+        return cls.from_labels(state["labels"], softness_from_plain(state["softness"])).resize(state["size"])
 
     def resize(self, size: tuple[int, int]) -> RegionMap:
         r"""Sample the map at another resolution; contours are smooth curves, not stairs.
@@ -325,11 +333,11 @@ class RegionMap:
         regions._labels, regions._index = (sample_labels(t, height, width) for t in (self._labels, self._index))
         regions._table, regions._source = self._table, self
         ratio = height * width / (self.size[0] * self.size[1])
-        regions._softness = scaled_softness(self._softness, ratio)
+        regions._softness = for_each(self._softness, lambda one: scaled_softness(one, ratio))
         return regions
 
 
-def wrap_labels(labels: Tensor, softness: float | Mapping[tuple[int, int], float]) -> RegionMap:
+def wrap_labels(labels: Tensor, softness: GivenSoftness) -> RegionMap:
     """Make the map of valid int64 labels without a copy: nobody else may write to them."""
     regions = RegionMap.__new__(RegionMap)
     regions._fill(labels, softness)

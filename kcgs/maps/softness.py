@@ -1,16 +1,20 @@
-"""Softness of contours, in pixels: one number for a whole map, or one for each pair of regions."""
+"""Softness of contours, in pixels: one number, or one for each pair of regions; and either for each map of a batch."""
 
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from kcgs._check import check_number
 
+from .labels import touching_pairs
 from .resampled import contour_variance
+
+T = TypeVar("T")
 
 MAX_SOFTNESS = 64.0  # pixels: a wider blur is no contour
 _PRINTED_PAIRS = 4  # of a repr
@@ -45,8 +49,33 @@ class PairSoftness(Mapping[tuple[int, int], float]):
         return f"PairSoftness({len(self)} pairs, {min(self.values()):.3g} to {max(self.values()):.3g} pixels)"
 
 
-def check_softness(softness: object, ids: Tensor) -> float | PairSoftness:
-    """Return one number where all pairs have the same softness, else that of each pair."""
+Pairs = Mapping[tuple[int, int], float]
+OneSoftness = float | PairSoftness
+# that of all maps, or of each map of a batch
+Softness = OneSoftness | tuple[OneSoftness, ...]
+# as users give it
+GivenSoftness = float | Pairs | Sequence[float | Pairs]
+
+
+def check_softness(softness: object, ids: Tensor, index: Tensor, is_batch: bool) -> Softness:
+    """Return one number where all pairs have the same softness, else that of each pair; one for all maps if they agree.
+
+    Args:
+        softness: as users give it.
+        ids: of the map or the batch, sorted.
+        index: position of each pixel's label among them, (maps, H, W).
+        is_batch: whether there may be one for each map.
+    """
+    if not isinstance(softness, list | tuple):
+        return _check_one(softness, ids)
+    if not is_batch or len(softness) != len(index):
+        expected = f"one, or one for each of {len(index)} maps" if is_batch else "that of one map"
+        raise ValueError(f"softness must be {expected}; got {len(softness)} of them")
+    parts = tuple(_check_one(part, ids[one.unique().long()]) for part, one in zip(softness, index, strict=True))
+    return parts[0] if all(part == parts[0] for part in parts) else parts
+
+
+def _check_one(softness: object, ids: Tensor) -> OneSoftness:
     if not isinstance(softness, Mapping):
         return check_number("softness", softness, 0.0, MAX_SOFTNESS, unit="pixels")
     known: set[int] = set(ids.tolist())
@@ -65,7 +94,7 @@ def check_softness(softness: object, ids: Tensor) -> float | PairSoftness:
     return PairSoftness(pixels) if len(distinct) > 1 else distinct.pop() if distinct else 0.0
 
 
-def softness_by_position(softness: float | PairSoftness, ids: Tensor) -> float | dict[tuple[int, int], float]:
+def softness_by_position(softness: OneSoftness, ids: Tensor) -> float | dict[tuple[int, int], float]:
     """Return softness with the places of ids among the sorted ones in place of ids."""
     if not isinstance(softness, PairSoftness):
         return softness
@@ -73,7 +102,7 @@ def softness_by_position(softness: float | PairSoftness, ids: Tensor) -> float |
     return {(position[a], position[b]): value for (a, b), value in softness.items()}
 
 
-def scaled_softness(softness: float | PairSoftness, ratio: float) -> float | PairSoftness:
+def scaled_softness(softness: OneSoftness, ratio: float) -> OneSoftness:
     """Return the softness of a map with so many new pixels per pixel, as rendered, at most `MAX_SOFTNESS`."""
     if not isinstance(softness, PairSoftness):
         return _scaled(softness, ratio)
@@ -85,9 +114,7 @@ def _scaled(softness: float, ratio: float) -> float:
     return min(float(contour_variance(variance, ratio).sqrt()), MAX_SOFTNESS)
 
 
-def merged_softness(
-    softness: float | PairSoftness, merged_id: Callable[[int], int]
-) -> float | Mapping[tuple[int, int], float]:
+def merged_softness(softness: OneSoftness, merged_id: Callable[[int], int]) -> float | Mapping[tuple[int, int], float]:
     """Return the softness where regions merge: that of a contour is the mean over the pairs it is made of."""
     if isinstance(softness, float):
         return softness
@@ -97,3 +124,40 @@ def merged_softness(
         if low != high:
             parts.setdefault((low, high), []).append(value)
     return {pair: sum(values) / len(values) for pair, values in parts.items()}
+
+
+def extended_softness(softness: OneSoftness, labels: Tensor, old_labels: Tensor) -> float | Pairs:
+    """Return the softness of other labels: pairs that touch there, and did not before, have the mean of all."""
+    if isinstance(softness, float):
+        return softness
+    mean = sum(softness.values()) / len(softness)
+    return dict.fromkeys(touching_pairs(labels) - touching_pairs(old_labels), mean) | {**softness}
+
+
+def softness_of_labels(softness: OneSoftness | Mapping[tuple[int, int], float], labels: Tensor) -> Any:
+    """Return the softness without the pairs of regions that labels do not have."""
+    if not isinstance(softness, Mapping):
+        return softness
+    ids = set(labels.unique().tolist())
+    return {pair: value for pair, value in softness.items() if ids.issuperset(pair)}
+
+
+def for_each(softness: Softness, function: Callable[..., T], *parts: Iterable[Any]) -> T | tuple[T, ...]:
+    """Apply a function to the softness of all maps, or to that of each with its other arguments."""
+    if not isinstance(softness, tuple):
+        return function(softness, *parts)
+    return tuple(function(*arguments) for arguments in zip(softness, *parts, strict=True))
+
+
+def softness_to_plain(softness: Softness) -> Any:
+    """Return softness as JSON has it: a number, triples of two ids and a number, or under "maps" a list of either."""
+    if isinstance(softness, tuple):
+        return {"maps": [softness_to_plain(part) for part in softness]}
+    return softness if isinstance(softness, float) else [[*pair, width] for pair, width in softness.items()]
+
+
+def softness_from_plain(plain: Any) -> Any:
+    """Return what `softness_to_plain` was given, as users give it."""
+    if isinstance(plain, dict):
+        return [softness_from_plain(part) for part in plain["maps"]]
+    return {(low, high): value for low, high, value in plain} if isinstance(plain, list) else plain

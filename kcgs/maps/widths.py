@@ -22,6 +22,9 @@ _FAR = 1 << 24
 _NO_KEY = 1 << 62
 
 
+Softness = float | Mapping[tuple[int, int], float]
+
+
 class ContourWidths(NamedTuple):
     """The widths of contours, and the one of each pixel."""
 
@@ -56,7 +59,7 @@ def blurs_of(widths: Sequence[float], device: torch.device) -> Tensor:
     return torch.cat([width, truncated_gaussian(distance, width)], 1).to(device, non_blocking=True)
 
 
-def find_widths(index: Tensor, num_regions: int, softness: float | Mapping[tuple[int, int], float]) -> ContourWidths:
+def find_widths(index: Tensor, num_regions: int, softness: Softness | tuple[Softness, ...]) -> ContourWidths:
     """Give each pixel the width of its nearest contour, on the map's device, which the host does not wait for.
 
     The nearest pixel that touches a contour has the same label: the way to another label crosses the contour earlier.
@@ -66,12 +69,27 @@ def find_widths(index: Tensor, num_regions: int, softness: float | Mapping[tuple
     Args:
         index: position of each pixel's region among the sorted ids, (maps, H, W) int32.
         num_regions: number of ids.
-        softness: the width in pixels, or that of each pair (a, b) of positions with a < b, 0 where absent.
+        softness: the width in pixels, or that of each pair (a, b) of positions with a < b, 0 where absent; or one of
+            these for each map.
     """
+    if isinstance(softness, tuple):
+        parts = [find_widths(one[None], num_regions, part) for one, part in zip(index, softness, strict=True)]
+        return _join_widths(parts, index)
     if not isinstance(softness, Mapping):
         return ContourWidths((softness,), None)
     search = spread_widths if index.device.type == "cpu" else search_widths
     return search(index, num_regions, softness)
+
+
+def _join_widths(parts: Sequence[ContourWidths], index: Tensor) -> ContourWidths:
+    """Return the widths of all maps of a batch, and the one of each pixel."""
+    widths = sorted({width for part in parts for width in part.widths})
+    pixels = torch.empty_like(index)
+    for k, part in enumerate(parts):
+        places = torch.tensor([widths.index(width) for width in part.widths], dtype=torch.int32)
+        places = places.to(index.device, non_blocking=True)
+        pixels[k] = places[0] if part.pixels is None else places[part.pixels[0].long()]
+    return ContourWidths(tuple(widths), pixels if len(widths) > 1 else None)
 
 
 def spread_widths(index: Tensor, num_regions: int, softness: Mapping[tuple[int, int], float]) -> ContourWidths:

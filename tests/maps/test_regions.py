@@ -5,7 +5,8 @@ from __future__ import annotations
 import copy
 import math
 import pickle
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
+from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene, load
 from kcgs.functional import PairSoftness, edge_band, lookup_regions, region_splat
 from kcgs.maps import Membership, membership_at, table_and_size
 from kcgs.maps.table import full_map
@@ -190,6 +191,62 @@ class TestPairSoftness:
     def test_exception(self, softness: object, error: type[Exception], words: str) -> None:
         with pytest.raises(error, match=words):
             RegionMap.from_labels(blobs(), softness)  # type: ignore[arg-type]
+
+
+class TestSoftnessOfEachMap:
+    """Maps of a batch may differ in softness: each is as it is alone."""
+
+    SOFTNESS: ClassVar[list[Any]] = [0.0, 0.7, {(0, 1): 0.7, (1, 2): 2.0}, {(0, 1): 1.3}]
+
+    def batch(self) -> tuple[Tensor, RegionMap]:
+        labels = torch.stack([blobs(seed=k) for k in range(4)])
+        return labels, RegionMap(labels, self.SOFTNESS)
+
+    @pytest.mark.parametrize("backend", ["cpu", "tiled", "reference"])
+    @pytest.mark.parametrize("size", [(45, 70), (90, 140)])
+    def test_renders_are_those_of_each_alone(self, backend: str, size: tuple[int, int]) -> None:
+        labels, regions = self.batch()
+        field = GaussianField.stack([GaussianField.random(40, (45, 70), regions=one, seed=0) for one in labels])
+        images = RegionSplatRenderer(backend=backend)(field, regions, size)
+        for k, (one, softness) in enumerate(zip(labels, self.SOFTNESS, strict=True)):
+            alone = RegionSplatRenderer(backend=backend)(field[k], RegionMap(one, softness), size)
+            torch.testing.assert_close(images[k], alone, rtol=0, atol=0 if size == (45, 70) else 1e-6)
+
+    def test_parts_copies_and_files(self, tmp_path: Path) -> None:
+        labels, regions = self.batch()
+        assert isinstance(regions.softness, tuple) and regions.softness[1] == 0.7 and regions[1].softness == 0.7
+        assert regions[2:].softness == regions.softness[2:] and regions[2].softness == regions.softness[2]
+        field = GaussianField.stack([GaussianField.random(5, (45, 70), regions=one, seed=0) for one in labels])
+        Scene(field, regions).save(tmp_path / "scenes.safetensors")
+        others = [pickle.loads(pickle.dumps(regions)), RegionMap.from_state(regions.state()), regions.resize((45, 70))]
+        for other in [*others, load(tmp_path / "scenes.safetensors").regions]:
+            assert other.softness == regions.softness
+            assert torch.equal(membership_of(other).tiles.weights, membership_of(regions).tiles.weights)
+        assert RegionMap(labels, [0.7] * 4).softness == 0.7
+        assert torch.equal(regions.merge([(0, 3)])[0].labels, torch.where(labels == 3, 0, labels))
+
+    def test_other_labels(self) -> None:
+        labels, regions = self.batch()
+        moved = regions.relabel(labels.flip(2), "mean")
+        for k in range(4):
+            assert moved[k].softness == regions[k].relabel(labels[k].flip(1), "mean").softness
+
+    @pytest.mark.parametrize(
+        ("labels", "softness", "words"),
+        [
+            (blobs(), [0.7], "softness must be that of one map; got 1 of them"),
+            (blobs()[None], [0.7, 0.7], "softness must be one, or one for each of 1 maps; got 2 of them"),
+            (torch.tensor([[[1, 2]], [[3, 4]]]), [{(3, 4): 0.7}, 0.0], r"different ids in the map; got \(3, 4\)"),
+        ],
+    )
+    def test_exception(self, labels: Tensor, softness: Any, words: str) -> None:
+        with pytest.raises(ValueError, match=words):
+            RegionMap(labels, softness)
+
+
+def test_pairs_of_a_batch_that_touch_anew_have_the_mean() -> None:
+    regions = RegionMap(torch.tensor([[[1, 1, 2, 5]], [[1, 2, 2, 5]]]), {(1, 2): 0.6, (2, 5): 1.0})
+    assert dict(regions.relabel(torch.tensor([[[1, 1, 2, 5]], [[1, 5, 2, 2]]]), "mean").softness)[1, 5] == 0.8
 
 
 def membership_of(regions: RegionMap) -> Membership:
