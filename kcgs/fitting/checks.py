@@ -24,16 +24,23 @@ def check_image_and_regions(image: Any, regions: object) -> tuple[Tensor, Region
     return image.detach().to(dtype, copy=True, memory_format=torch.contiguous_format), regions
 
 
-def regions_of(size: tuple[int, ...], regions: object) -> RegionMap | None:
-    """Return a label map as one map of a size."""
+def regions_of(size: tuple[int, ...], regions: object, num_images: int | None = None) -> RegionMap | None:
+    """Return a label map as one map of a size; for a batch of images there may be one for each."""
     regions = as_region_map(regions)
     if regions is None:
         return None
     if regions.num_maps == 1:
         regions = regions[0]
-    if regions.size != tuple(size) or regions.num_maps is not None:
-        raise InvalidArgument("regions", f"one map of the image's size {tuple(size)}", tuple(regions.labels.shape))
+    if regions.size != tuple(size) or regions.num_maps not in (None, num_images):
+        each = "" if num_images is None else f", or one for each of {num_images} images,"
+        expected = f"one map{each} of the image's size {tuple(size)}"
+        raise InvalidArgument("regions", expected, tuple(regions.labels.shape))
     return regions
+
+
+def map_of_each(regions: RegionMap | None, count: int) -> list[RegionMap | None]:
+    """Return the map of each of so many images: of a batch with their own regions, else the one that all have."""
+    return [regions if regions is None or regions.num_maps is None else regions[k] for k in range(count)]
 
 
 def check_num_gaussians(value: object, image: Tensor) -> int:

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from kcgs._check import check_count
-from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap
-from kcgs.maps import as_region_map
 from kcgs.nn import GaussianField
 
-from .checks import check_image_and_regions, check_num_gaussians
+from .checks import check_image_and_regions, check_num_gaussians, map_of_each, regions_of
 
 # sum of the weights of Gaussians of half the spacing at a pixel
 OVERLAP = math.pi / 2
@@ -53,21 +50,12 @@ def initial_field(
         torch.Size([4, 60, 2])
     """
     if isinstance(image, Tensor) and image.ndim == 4 and len(image):
-        pairs = zip(image, _split_maps(regions, len(image)), strict=True)
-        return GaussianField.stack([initial_field(one, num_gaussians, labels, seed) for one, labels in pairs])
+        maps = map_of_each(regions_of(image.shape[-2:], regions, len(image)), len(image))
+        pairs = zip(image, maps, strict=True)
+        return GaussianField.stack([initial_field(one, num_gaussians, of_one, seed) for one, of_one in pairs])
     image, regions = check_image_and_regions(image, regions)
     count = check_num_gaussians(num_gaussians, image)
     return uniform_field(image, count, regions, check_count("seed", seed, 0, 2**63 - 1))
-
-
-def _split_maps(regions: RegionMap | Tensor | None, count: int) -> Sequence[RegionMap | Tensor | None]:
-    """Return the map of each of so many images."""
-    regions = as_region_map(regions)
-    if regions is None or regions.num_maps is None:
-        return [regions] * count
-    if regions.num_maps not in (1, count):
-        raise InvalidArgument("regions", f"one map, or one for each of {count} images", f"{regions.num_maps} maps")
-    return regions.labels.expand(count, -1, -1).unbind()
 
 
 def uniform_field(image: Tensor, num_gaussians: int, regions: RegionMap | None, seed: int) -> GaussianField:

@@ -12,13 +12,12 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
 from kcgs._check import check_count, check_floating
-from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap, halve, lookup_regions, region_splat
 from kcgs.kernels import check_backend, takes_triton
-from kcgs.nn import GaussianField
+from kcgs.nn import GaussianField, pad_rows
 from kcgs.optim import Objective, Renderer
 
-from .checks import regions_of
+from .checks import map_of_each, regions_of
 from .state import FitState
 
 # Standard deviations that are tried, in pixels, by the side of the blocks that the residual is averaged over for them.
@@ -53,18 +52,19 @@ def propose_gaussians(
     Nothing is sampled at random. The strongest of each round come first.
 
     Args:
-        error: image - render, :math:`(C, H, W)` or :math:`(1, C, H, W)`, floating.
-        num_gaussians: how many to find, at least 1; there are fewer where no others lower the error.
-        regions: the RegionMap or label map of the render, of the error's size; each Gaussian gets the region under its
-            centre. None: Gaussians are not confined.
+        error: image - render, :math:`(C, H, W)`, or of a batch, :math:`(B, C, H, W)`, floating.
+        num_gaussians: how many to find for each image, at least 1; there are fewer where no others lower the error.
+        regions: the RegionMap or label map of the render, of the error's size, for a batch one for all or one for each
+            image; each Gaussian gets the region under its centre. None: Gaussians are not confined.
         backend: as in :func:`kcgs.functional.region_splat`.
 
     Returns:
-        A field, without a graph.
+        A field, without a graph; a batch of them for :math:`(B, C, H, W)`, where rows of an image that finds fewer
+        than others have the colour 0.
 
     Raises:
         TypeError: an error that is no floating Tensor, or a number that is not whole.
-        ValueError: an error of another shape or that is not finite, a number below 1, a map of another size.
+        ValueError: an error of another shape or that is not finite, a number below 1, maps of another size or number.
 
     Example:
         >>> from kcgs.functional import region_splat
@@ -76,12 +76,16 @@ def propose_gaussians(
     Source: Mallat and Zhang, "Matching Pursuits with Time-Frequency Dictionaries", 1993, many atoms in a round.
     """
     error = check_floating("error", error, dims=(3, 4)).detach()
-    if error.ndim == 4 and len(error) > 1:
-        raise InvalidArgument("error", "of one image", tuple(error.shape))
-    error = error.reshape(error.shape[-3:]).to(torch.promote_types(error.dtype, torch.float32))
-    map_of_error = regions_of(tuple(error.shape[1:]), regions)
-    count = check_count("num_gaussians", num_gaussians)
-    return propose(error.contiguous(), map_of_error, count, backend=check_backend(backend))
+    error = error.to(torch.promote_types(error.dtype, torch.float32)).contiguous()
+    batch = len(error) if error.ndim == 4 else None
+    map_of_error = regions_of(tuple(error.shape[-2:]), regions, batch)
+    count, backend = check_count("num_gaussians", num_gaussians), check_backend(backend)
+    if batch is None:
+        return propose(error, map_of_error, count, backend=backend)
+    pairs = zip(error, map_of_each(map_of_error, batch), strict=True)
+    fields = [propose(one, of_one, count, backend=backend) for one, of_one in pairs]
+    most = max(field.num_gaussians for field in fields)
+    return GaussianField.stack([pad_rows(field, most) for field in fields])
 
 
 def propose(residual: Tensor, regions: RegionMap | None, count: int, *, backend: str = "auto") -> GaussianField:

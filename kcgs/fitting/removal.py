@@ -30,19 +30,20 @@ def lowest_impact(
     overlaps, and of the best length.
 
     Args:
-        field: N Gaussians of one image, without opacities.
-        num_gaussians: how many to remove, from 0 to N.
-        regions: the RegionMap or label map of the field's size, if Gaussians are confined.
+        field: N Gaussians of an image, or of each image of a batch, without opacities.
+        num_gaussians: how many to remove of each image, from 0 to N.
+        regions: the RegionMap or label map of the field's size, if Gaussians are confined; for a batch one for all or
+            one for each image.
         backend: as in :func:`kcgs.functional.region_splat`.
 
     Returns:
-        A mask of those to remove, boolean :math:`(N)`, and the colours of all, :math:`(N, C)`: the others stand in for
-        them.
+        A mask of those to remove, boolean :math:`(N)` or :math:`(B, N)`, and the colours of all, :math:`(N, C)` or
+        :math:`(B, N, C)`: the others stand in for them.
 
     Raises:
         TypeError: no field, or a number that is not whole.
-        ValueError: a field that is batched or has opacities, a number above N, a map of another size, or a map for
-            Gaussians without ids.
+        ValueError: a field with opacities, a number above N, maps of another size or number, or a map for Gaussians
+            without ids.
 
     Example:
         >>> field = GaussianField.random(20, (16, 24), seed=0)
@@ -52,42 +53,44 @@ def lowest_impact(
     """
     if not isinstance(field, GaussianField):
         raise InvalidArgumentType("field", "a GaussianField", type(field).__name__)
-    if field.means.ndim != 2 or field.opacities is not None:
-        received = f"means {tuple(field.means.shape)}" if field.opacities is None else "opacities"
-        raise InvalidArgument("field", "of one image, without opacities", received)
-    map_of_field = regions_of(field.size, regions)
+    if field.opacities is not None:
+        raise InvalidArgument("field", "without opacities", "a field with opacities")
+    map_of_field = regions_of(field.size, regions, field.means.shape[0] if field.means.ndim == 3 else None)
     if (map_of_field is None) != (field.region_ids is None):
         raise InvalidArgument("regions", "given where the field has region ids, and only there", regions)
     count = check_count("num_gaussians", num_gaussians, 0, field.num_gaussians)
     gaussians, renderer = Gaussians.of(field), Renderer(field.size, map_of_field, backend=check_backend(backend))
-    return lowest_weighted_impact(renderer, gaussians, count, torch.ones_like(gaussians.means[:, 0]))
+    return lowest_weighted_impact(renderer, gaussians, count, torch.ones_like(gaussians.means[..., 0]))
 
 
 @torch.no_grad()
 def lowest_weighted_impact(
     renderer: Renderer, gaussians: Gaussians, count: int, weight: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Do what `lowest_impact` does, by a weight of the squared error of each Gaussian, (N,)."""
+    """Do what `lowest_impact` does, by a weight of the squared error of each Gaussian, (N,) or (B, N)."""
     _, cholesky, colors, _ = gaussians
 
     def products(cholesky: Tensor, colors: Tensor) -> Tensor:
         return renderer.inner_products(gaussians._replace(cholesky=cholesky, colors=colors))
 
-    area = math.pi * cholesky[:, :1] * cholesky[:, 2:]
-    energy = weight * colors.square().sum(1) * area[:, 0]
-    is_strong = torch.ones_like(energy, dtype=torch.bool)
-    is_strong[energy.argsort(stable=True)[: len(energy) // 2]] = False
-    norm, factors = (0.5 * area).rsqrt(), is_strong[:, None].to(colors)
+    area = math.pi * cholesky[..., :1] * cholesky[..., 2:]
+    energy = weight * colors.square().sum(-1) * area[..., 0]
+    is_strong = ~_lowest(energy, energy.shape[-1] // 2)
+    norm, factors = (0.5 * area).rsqrt(), is_strong[..., None].to(colors)
     overlaps = norm * products(cholesky / math.sqrt(2.0), norm * factors)
     crowding = 1.0 + (overlaps - factors).clamp_min(0.0)
-    removed = torch.zeros_like(is_strong)
-    removed[(energy / crowding[:, 0]).argsort(stable=True)[:count]] = True
-    removed_products = products(cholesky, colors * removed[:, None])
-    step = removed_products / (area * crowding) * ~removed[:, None]
+    removed = _lowest(energy / crowding[..., 0], count)
+    removed_products = products(cholesky, colors * removed[..., None])
+    step = removed_products / (area * crowding) * ~removed[..., None]
     # inner products of the step's render, with what is removed and with itself
-    tiny = torch.finfo(step.dtype).tiny
-    length = (step * removed_products).sum() / (step * products(cholesky, step)).sum().clamp_min(tiny)
+    square = (step * products(cholesky, step)).sum((-2, -1), keepdim=True)
+    length = (step * removed_products).sum((-2, -1), keepdim=True) / square.clamp_min(torch.finfo(step.dtype).tiny)
     return removed, colors + length * step
+
+
+def _lowest(values: Tensor, count: int) -> Tensor:
+    """Mark the lowest values of each image, so many; of equal ones the first."""
+    return torch.zeros_like(values, dtype=torch.bool).scatter_(-1, values.argsort(stable=True)[..., :count], True)
 
 
 @torch.no_grad()

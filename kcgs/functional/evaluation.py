@@ -68,12 +68,12 @@ def squared_error_gradients(
     cutoff: float,
     backend: str,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the gradients of half the squared error of a render, summed over the pixels of an image (C, H, W).
+    """Return the gradients of half the squared error of a render, summed over the pixels of an image, (..., C, H, W).
 
     For descents: one pass over the image where the backend has it, no graph, and shapes are not checked.
     """
     table = None if regions is None else table_and_size(regions)[0]
-    gaussians, size = (means.detach(), cholesky.detach(), colors.detach()), (image.shape[1], image.shape[2])
+    gaussians, size = (means.detach(), cholesky.detach(), colors.detach()), (image.shape[-2], image.shape[-1])
     arguments = SplatArguments(*gaussians, region_ids, table, size, cutoff, backend)
     evaluation = prepare(arguments)
     kernel, inputs, plan = evaluation

@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from kcgs._check import (
     check_count,
@@ -318,3 +319,16 @@ def join(first: GaussianField, second: GaussianField) -> GaussianField:
         opacities = concatenate(*opaque)
     means, cholesky = concatenate(first.means, second.means), concatenate(first.cholesky, second.cholesky)
     return GaussianField(means, cholesky, concatenate(first.colors, second.colors), ids, opacities, size=first.size)
+
+
+def pad_rows(field: GaussianField, count: int) -> GaussianField:
+    """Return a field of one image, without opacities, with rows of the colour 0 up to a number, and without the graph.
+
+    They are of the region of the first Gaussian, or of region 0 where there is none.
+    """
+    missing = (0, 0, 0, count - field.num_gaussians)
+    means, cholesky = (pad(table.detach(), missing, value=1.0) for table in (field.means, field.cholesky))
+    ids = field.region_ids
+    if ids is not None:
+        ids = torch.cat([ids, (ids[:1] if len(ids) else ids.new_zeros(1)).expand(missing[3])])
+    return GaussianField(means, cholesky, pad(field.colors.detach(), missing), ids, size=field.size)

@@ -173,22 +173,31 @@ class GaussianAdam(Optimizer):
 
         Args:
             field: one that the optimizer was made for; it gets new parameters.
-            mask: boolean :math:`(N)`, for all images of a batch.
+            mask: boolean :math:`(N)`, for all images of a batch; or :math:`(B, N)`, with as many in each image.
 
         Raises:
-            ValueError: a field that the optimizer was not made for; a mask of another type or shape.
+            ValueError: a field that the optimizer was not made for; a mask of another type or shape, or of more
+                Gaussians in one image than in another.
         """
         self._group(field)
-        if mask.dtype != torch.bool or mask.shape != (field.num_gaussians,):
-            raise InvalidArgument("mask", f"boolean, ({field.num_gaussians})", f"{mask.dtype}, {tuple(mask.shape)}")
-        rows, index = field.means.ndim - 2, mask.nonzero()[:, 0]
+        shapes = (field.means.shape[-2:-1], field.means.shape[:-1])
+        if mask.dtype != torch.bool or mask.shape not in shapes:
+            expected = " or ".join(f"({', '.join(map(str, shape))})" for shape in dict.fromkeys(shapes))
+            raise InvalidArgument("mask", f"boolean, {expected}", f"{mask.dtype}, {tuple(mask.shape)}")
+        index = mask.nonzero()[:, -1]
+        if mask.ndim == 2:
+            counts = mask.sum(1)
+            if not bool((counts == counts[0]).all()):
+                raise InvalidArgument("mask", "of as many Gaussians in each image", counts.tolist())
+            index = index.view(len(mask), -1)
         for name in ("means", "cholesky", "colors", "opacities"):
             if (value := getattr(field, name)) is not None:
-                self._replace(field, name, value.index_select(rows, index))
+                self._replace(field, name, _select_rows(value, index, field.means.ndim - 2))
         if field.region_ids is not None:
-            field.region_ids = field.region_ids.index_select(rows, index)
+            field.region_ids = _select_rows(field.region_ids, index, field.region_ids.ndim - 1)
         for state in self._states(field):
-            state.update({name: average.index_select(rows, index) for name, average in state.items()})
+            rows = {name: _select_rows(average, index, average.ndim - 2) for name, average in state.items()}
+            state.update(rows)
 
     def _group(self, field: GaussianField) -> dict[str, Any]:
         """Return the group of a field's geometry; ValueError for a field that the optimizer was not made for."""
@@ -209,6 +218,14 @@ class GaussianAdam(Optimizer):
 
     def _states(self, field: GaussianField) -> Iterator[dict[str, Tensor]]:
         return (self.state[tensor] for tensor in (field.means, field.colors) if tensor in self.state)
+
+
+def _select_rows(table: Tensor, index: Tensor, rows: int) -> Tensor:
+    """Return rows of a table, whose dimension they are: (N',) for all images, or (B, N') for each."""
+    if index.ndim == 1:
+        return table.index_select(rows, index)
+    columns = table.shape[2:]
+    return table.gather(1, index.view(*index.shape, *[1] * len(columns)).expand(*index.shape, *columns))
 
 
 def _layout(field: GaussianField) -> str:

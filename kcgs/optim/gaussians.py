@@ -21,12 +21,12 @@ def draft_cutoff(cutoff: float) -> float:
 
 
 class Gaussians(NamedTuple):
-    """The numbers of the Gaussians of one image, or a gradient by each of them."""
+    """The numbers of the Gaussians of an image or a batch, or a gradient by each of them."""
 
-    means: Tensor  # [N, 2]
-    cholesky: Tensor  # [N, 3]
-    colors: Tensor  # [N, C]
-    region_ids: Tensor | None = None  # [N]
+    means: Tensor  # [..., N, 2]
+    cholesky: Tensor  # [..., N, 3]
+    colors: Tensor  # [..., N, C]
+    region_ids: Tensor | None = None  # [..., N]
 
     @classmethod
     def of(cls, field: GaussianField) -> Gaussians:
@@ -72,7 +72,8 @@ class Renderer(NamedTuple):
     def inner_products(self, gaussians: Gaussians) -> Tensor:
         """Sum the render over the weights of each Gaussian, (N, C), in one pass where the backend has it."""
         # against a black image, half the gradient by a colour is the inner product
-        black = gaussians.colors.new_zeros(gaussians.colors.shape[1], *self.size)
+        *batch, _, channels = gaussians.colors.shape
+        black = gaussians.colors.new_zeros(*batch, channels, *self.size)
         return self.squared_error_gradients(gaussians, black).colors
 
     @torch.enable_grad()

@@ -167,7 +167,7 @@ class TestLoop:
                 field.colors.data = colors
                 optimizer.keep(field, ~mask)
                 error = image() - renderer(field, regions).detach()
-                optimizer.append(field, propose_gaussians(error[None], 12, regions))
+                optimizer.append(field, propose_gaussians(error, 12, regions))
             optimizer.zero_grad()
             values.append(l1(renderer(field, regions)[None]))
             values[-1].backward()
@@ -182,7 +182,11 @@ class TestLoop:
         ("arguments", "error", "words"),
         [
             ((image()[0], 3), ValueError, "error must have 3 or 4 dimensions"),
-            ((image()[None].expand(2, 3, 32, 40), 3), ValueError, "error must be of one image"),
+            (
+                (image()[None].expand(2, -1, -1, -1), 3, LABELS.expand(3, -1, -1)),
+                ValueError,
+                "one for each of 2 images",
+            ),
             ((image() / 0, 3), ValueError, "error must be finite"),
             ((image(), 0), ValueError, "num_gaussians must be at least 1; got 0"),
             ((image(), 3, LABELS[1:]), ValueError, "regions must be one map of the image's size"),

@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcgs import RegionMap, fit
+from kcgs import GaussianField, RegionMap, fit
+from kcgs.fitting import lowest_impact
 from kcgs.fitting.removal import lowest_weighted_impact
 from kcgs.functional import psnr, region_splat
 from kcgs.optim.gaussians import Gaussians, Renderer
@@ -82,6 +83,21 @@ def test_extremes_are_finite(count: int) -> None:
     scene.cholesky[0], scene.cholesky[1] = torch.tensor([1e4, 0.0, 0.1]), torch.tensor([1e-3, 0.0, 1e-3])
     removed, colors, _, _ = scene.remove(count)
     assert len(removed) == count and torch.isfinite(colors).all()
+
+
+@pytest.mark.parametrize("maps", [None, "one", "each"])
+def test_a_batch_is_as_each_image_alone(maps: str | None) -> None:
+    """Bit for bit on a CPU; rows of colour 0 are the first to go."""
+    labels = torch.stack([(torch.arange(60) >= x).long().expand(SIZE) for x in (20, 30, 40)])
+    regions = {None: None, "one": labels[0], "each": RegionMap(labels)}[maps]
+    own = [None if maps is None else labels[0 if maps == "one" else k] for k in range(3)]
+    fields = [GaussianField.random(50, SIZE, regions=one, seed=k, sigma=4.0) for k, one in enumerate(own)]
+    fields[1].colors.data[7:12] = 0.0
+    mask, colors = lowest_impact(GaussianField.stack(fields), 12, regions)
+    for k, (field, one) in enumerate(zip(fields, own, strict=True)):
+        expected = lowest_impact(field, 12, one)
+        assert torch.equal(mask[k], expected[0]) and torch.equal(colors[k], expected[1])
+    assert mask[1, 7:12].all()
 
 
 class TestFit:

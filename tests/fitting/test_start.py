@@ -131,7 +131,7 @@ class TestInitialField:
         ("change", "error", "words"),
         [
             ({"image": torch.zeros(3, 1, 4, 4), "regions": torch.zeros(2, 4, 4).long()}, ValueError,
-             "regions must be one map, or one for each of 3 images; got 2 maps"),
+             r"regions must be one map, or one for each of 3 images, of the image's size \(4, 4\); got \(2, 4, 4\)"),
             ({"image": torch.zeros(0, 1, 4, 4)}, ValueError, "image must be one image"),
             ({"image": 3}, TypeError, "image must be a Tensor"),
             ({"num_gaussians": 0}, ValueError, "num_gaussians must be at least 1; got 0"),

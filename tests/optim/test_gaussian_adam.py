@@ -269,6 +269,29 @@ class TestProtocol:
         torch.testing.assert_close(field.cholesky.detach()[-1], torch.tensor([2.0, 0.0, 2.0]))
 
 
+def test_keep_takes_a_mask_for_each_image() -> None:
+    """What is left of each image is as if it were alone."""
+    fields = [GaussianField.random(20, SIZE, regions=torch.zeros(SIZE).long(), seed=k) for k in range(3)]
+    batch, masks = GaussianField.stack(fields), torch.stack([torch.randperm(20) < 13 for _ in range(3)])
+    optimizer, others = GaussianAdam(batch), [GaussianAdam(field) for field in fields]
+    for field in (batch, *fields):
+        for table in (field.means, field.cholesky, field.colors):
+            table.grad = torch.full_like(table, 0.3)
+    optimizer.step()
+    optimizer.keep(batch, masks)
+    for k, (field, other) in enumerate(zip(fields, others, strict=True)):
+        other.step()
+        other.keep(field, masks[k])
+        for name in ("means", "cholesky", "colors", "region_ids"):
+            assert torch.equal(getattr(batch, name)[k], getattr(field, name))
+        pairs = zip(optimizer.state.values(), other.state.values(), strict=True)
+        assert all(torch.equal(a[name][k], b[name]) for a, b in pairs for name in a)
+    with pytest.raises(ValueError, match=r"mask must be of as many Gaussians in each image; got \[13, 12, 13\]"):
+        optimizer.keep(batch, torch.arange(13) < torch.tensor([[13], [12], [13]]))
+    with pytest.raises(ValueError, match=r"mask must be boolean, \(13\) or \(3, 13\); got"):
+        optimizer.keep(batch, torch.ones(2, 13) > 0)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 class TestRows:
     def test_keep_leaves_the_averages_of_the_others(self, kind: str) -> None:
