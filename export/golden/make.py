@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
-from kcgs.maps import map_operands, membership_at
+from kcgs.maps import membership_at, table_and_size
 from kcgs.onnx import scene_decoder
 
 Array = np.ndarray[Any, Any]
@@ -124,8 +124,8 @@ def make_arrays(case: Case) -> dict[str, Array]:
         arrays[name] = tensor.numpy().astype(np.min_scalar_type(int(regions.ids.max())))
     pairs = case.softness
     arrays["softness"] = np.array([(*k, v) for k, v in pairs.items()] if isinstance(pairs, Mapping) else pairs)
-    membership = membership_at(map_operands(regions))
-    if membership.width_index is not None:
+    membership = membership_at(*table_and_size(regions))
+    if membership.table.width_index is not None:
         # a pixel may be equally near to several contours: other programs need not break the tie as this one does
         arrays["contour_width"] = membership.variances[0].sqrt().float().numpy()
     visible = torch.ones(regions.num_regions)

@@ -14,7 +14,7 @@ from kcgs._progress import Progress
 from kcgs._warn import warn_user
 from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
-from kcgs.kernels import prepare
+from kcgs.kernels import warm_up
 from kcgs.nn import GaussianField
 from kcgs.optim import End, Event, Loss, run
 
@@ -150,7 +150,7 @@ def fit_problem(
     canvas = problem.canvas
     if problem.config.max_seconds is not None:
         precompile(problem.config, canvas.device)
-    prepare(problem.config.backend, canvas.device, canvas.dtype, len(canvas))
+    warm_up(problem.config.backend, canvas.device, canvas.dtype, len(canvas))
     _warn_of_regions(problem)
     searches = problem.config.target_psnr is not None
     with Progress("fit", pulse=searches, visible=progress) as bar, threads_for_kernels(canvas[0].numel()):

@@ -8,8 +8,9 @@ from torch import Tensor
 
 from kcgs.maps import MapTable
 
-_NUM_GAUSSIANS = 4  # arguments before the table
-_END = _NUM_GAUSSIANS + len(MapTable._fields)
+# places of the table among the arguments, and of what follows
+_TABLE = 4
+_END = _TABLE + len(MapTable._fields)
 # of the operator, which takes the fields of a table one by one, as all operators of torch do
 SCHEMA = (
     "Tensor means, Tensor cholesky, Tensor colors, Tensor? region_ids, "
@@ -37,17 +38,17 @@ class SplatArguments(NamedTuple):
     @classmethod
     def of(cls, *values: Any) -> SplatArguments:
         """Take the arguments in the order of the schema."""
-        table = None if values[_NUM_GAUSSIANS] is None else MapTable(*values[_NUM_GAUSSIANS:_END])
-        means, cholesky, colors, region_ids = values[:_NUM_GAUSSIANS]
+        table = None if values[_TABLE] is None else MapTable(*values[_TABLE:_END])
+        means, cholesky, colors, region_ids = values[:_TABLE]
         height, width, cutoff, backend = values[_END:]
         return cls(means, cholesky, colors, region_ids, table, (height, width), cutoff, backend)
 
     def flatten(self) -> tuple[Any, ...]:
         """Return the arguments in the order of the schema."""
         table = [None] * len(MapTable._fields) if self.table is None else self.table
-        return (*self[:_NUM_GAUSSIANS], *table, *self.size, self.cutoff, self.backend)
+        return (*self[:_TABLE], *table, *self.size, self.cutoff, self.backend)
 
 
 def place_of(name: str) -> int:
     """Return the place of a field of the table among the arguments."""
-    return _NUM_GAUSSIANS + MapTable._fields.index(name)
+    return _TABLE + MapTable._fields.index(name)

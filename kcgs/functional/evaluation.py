@@ -6,7 +6,7 @@ public function.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import torch
 from torch import Tensor
@@ -28,13 +28,20 @@ class Evaluation(NamedTuple):
 
 def prepare(arguments: SplatArguments, check: bool = True) -> Evaluation:
     """Prepare Gaussians and map for the kernel that the backend names, with `check` of values."""
-    inputs, kernel = _prepare(arguments, check)
+    inputs, kernel = _make_inputs(arguments, check)
     plan = kernel.plan(inputs)
-    if plan is None and kernel.checks_values:
-        check_values(*arguments[:3])
-    if kernel.looks_up_regions and (plan is None or (check and plan.foreign)):
-        _look_up(inputs, True)
+    if plan is None:
+        _refuse(arguments, inputs)
+    if check and kernel.looks_up_regions and plan.foreign:
+        _check_ids(inputs)
     return Evaluation(kernel, inputs, plan)
+
+
+def _refuse(arguments: SplatArguments, inputs: SplatInputs) -> NoReturn:
+    """Say which value a kernel, which returned no plan, does not take."""
+    check_values(*arguments[:3])
+    _check_ids(inputs)
+    raise AssertionError("a kernel refuses values that pass the checks")
 
 
 def render(arguments: SplatArguments, evaluation: Evaluation) -> Tensor:
@@ -112,7 +119,7 @@ def differentiate_forward(tangents: tuple[Tensor, Tensor, Tensor], arguments: Sp
 
 def _image_with_graph(arguments: SplatArguments) -> tuple[Tensor, list[Tensor]]:
     """Render with a graph, and return its leaves, too."""
-    inputs, kernel = _prepare(arguments, check=False)
+    inputs, kernel = _make_inputs(arguments, check=False)
     if kernel.image is None:
         raise RuntimeError(
             f"backend {arguments.backend!r} has first derivatives by backward only: backend 'reference' has all"
@@ -122,7 +129,7 @@ def _image_with_graph(arguments: SplatArguments) -> tuple[Tensor, list[Tensor]]:
     return image if arguments.means.ndim == 3 else image.squeeze(0), leaves
 
 
-def _prepare(arguments: SplatArguments, check: bool) -> tuple[SplatInputs, Kernel]:
+def _make_inputs(arguments: SplatArguments, check: bool) -> tuple[SplatInputs, Kernel]:
     """Return the inputs of the kernel, and the kernel."""
     ids = regions = table = None
     if arguments.table is not None and arguments.region_ids is not None:
@@ -141,12 +148,24 @@ def _look_up(inputs: SplatInputs, check: bool) -> SplatInputs:
     """Put the positions of regions in place of their ids."""
     if inputs.ids is None or inputs.region_index is None:
         return inputs
-    region_ids = inputs.region_index if inputs.region_index.ndim == 2 else inputs.region_index[None]
-    index = positions_of(region_ids, inputs.ids)
+    index = _positions(inputs)
     known = index.device.type == "cpu" and int(index.numpy().min(initial=0)) >= 0
     if check and not known:
-        check_region_ids(region_ids, index)
+        check_region_ids(inputs.region_index, index)
     # one region covers everything: no map, but Gaussians of other ids still paint nothing
     if len(inputs.ids) == 1 and known:
         return inputs._replace(region_index=None, table=None, ids=None)
     return inputs._replace(region_index=index, ids=None)
+
+
+def _check_ids(inputs: SplatInputs) -> None:
+    """Refuse negative region ids, and warn of those that the map does not hold."""
+    if inputs.ids is not None and inputs.region_index is not None:
+        check_region_ids(inputs.region_index, _positions(inputs))
+
+
+def _positions(inputs: SplatInputs) -> Tensor:
+    """Return the position of each Gaussian's region among the ids of the map, (B, N)."""
+    assert inputs.ids is not None and inputs.region_index is not None
+    region_ids = inputs.region_index
+    return positions_of(region_ids if region_ids.ndim == 2 else region_ids[None], inputs.ids)

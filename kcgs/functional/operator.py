@@ -264,30 +264,30 @@ def _backward_vmap(
     return tuple(g.unflatten(0, (info.batch_size, -1)) if batched else g for g in gradients), (0, 0, 0)
 
 
-def _fold(info: Any, in_dims: tuple[int | None, ...], arguments: tuple[Any, ...], means: int) -> tuple[bool, list[Any]]:
-    """Put the mapped dimension of every tensor into its batch; `means` is the place of that argument.
+def _fold(info: Any, in_dims: tuple[int | None, ...], arguments: tuple[Any, ...], first: int) -> tuple[bool, list[Any]]:
+    """Put the mapped dimension of every tensor into its batch; `first` is the place of the means.
 
     Returns, first, whether there was a batch.
     """
-    places = {name: means + place_of(name) for name in MapTable._fields}
+    places = {name: first + place_of(name) for name in MapTable._fields}
     labels = places["labels"]
     if any(in_dims[k] is not None for k in places.values() if k != labels):
         raise ValueError("a RegionMap cannot be mapped over: give the images as a batch")
 
     def mapped(k: int) -> Tensor:
         tensor, dim = arguments[k], in_dims[k]
-        first: Tensor = tensor.expand(info.batch_size, *tensor.shape) if dim is None else tensor.movedim(dim, 0)
-        return first
+        moved: Tensor = tensor.expand(info.batch_size, *tensor.shape) if dim is None else tensor.movedim(dim, 0)
+        return moved
 
     folded = list(arguments)
-    batched = mapped(means).ndim == 4
+    batched = mapped(first).ndim == 4
     for k in range(labels):
         if arguments[k] is not None:
             folded[k] = mapped(k).flatten(0, 1) if batched else mapped(k)
     maps = arguments[labels]
     # a map that all images share stays as it is
     if maps is not None and (in_dims[labels] is not None or (maps.ndim == 3 and maps.shape[0] > 1)):
-        count = mapped(means).shape[1] if batched else 1
+        count = mapped(first).shape[1] if batched else 1
 
         def each(k: int) -> Tensor:
             part = mapped(k)

@@ -104,9 +104,9 @@ def splat_at(
         region_ids = check_ids("region_ids", region_ids, means, values=False)
         _check_map(table, means)
     dtype = torch.float64 if torch.float64 in (means.dtype, cholesky.dtype, colors.dtype) else torch.float32
-    means, cholesky, rgb = (t if t.dtype == dtype else t.to(dtype) for t in (means, cholesky, colors))
+    means, cholesky, converted = (t if t.dtype == dtype else t.to(dtype) for t in (means, cholesky, colors))
     backend = check_backend(backend)
-    arguments = SplatArguments(means, cholesky, rgb, region_ids, table, size, check_cutoff(cutoff), backend)
+    arguments = SplatArguments(means, cholesky, converted, region_ids, table, size, check_cutoff(cutoff), backend)
     image: Tensor = splat_operator(*arguments.flatten())
     return image if colors.dtype == dtype else image.to(colors.dtype)
 

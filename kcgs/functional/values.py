@@ -7,7 +7,7 @@ from torch import Tensor
 
 from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument
-from kcgs.kernels import MEAN_LIMIT, SCALE_LIMITS
+from kcgs.kernels import MEAN_LIMIT, SCALE_LIMITS, SCALE_TOLERANCE
 
 _OUT_OF_RANGE = (
     "Where an optimizer's step made them so, take a smaller learning rate, or kcgs.optim.GaussianAdam, which keeps a "
@@ -23,7 +23,7 @@ def check_values(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
     (least, most), diagonal, l21 = SCALE_LIMITS, cholesky[..., ::2], cholesky[..., 1]
     bounds = f"finite, l11 and l22 in [{least:g}, {most:g}] pixels and |l21| at most {most:g}"
     # comparisons with NaN must fail
-    in_range = (diagonal >= least * (1 - 1e-6)) & (diagonal <= most)
+    in_range = (diagonal >= least * (1 - SCALE_TOLERANCE)) & (diagonal <= most)
     _check("means", means, means.abs() <= MEAN_LIMIT, f"finite, within {MEAN_LIMIT:g} pixels")
     _check("cholesky", diagonal, in_range, bounds, "l11 and l22 in ")
     _check("cholesky", l21, l21.abs() <= most, bounds, "l21 in ")

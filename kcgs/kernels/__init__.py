@@ -14,13 +14,13 @@ All take the inputs of `interface`, and share `whitened` coordinates.
 from .coarse_grids import Blocks, Coarsened, choose_levels, coarsen, make_blocks, max_spacing
 from .cuda.capacity import settle, without_waiting
 from .interface import Kernel, SplatInputs, with_autograd
-from .registry import BACKENDS, check_backend, prepare, resolve, takes_triton
+from .registry import BACKENDS, check_backend, resolve, takes_triton, warm_up
 from .tiles import bounding_tiles, find_keys
-from .whitened import MEAN_LIMIT, SCALE_LIMITS, Z_LIMIT, least_exponent, support_radius
+from .whitened import MEAN_LIMIT, SCALE_LIMITS, SCALE_TOLERANCE, Z_LIMIT, least_exponent, support_radius
 
 __all__ = [
-    "BACKENDS", "MEAN_LIMIT", "SCALE_LIMITS", "Z_LIMIT", "Blocks", "Coarsened", "Kernel", "SplatInputs",
-    "bounding_tiles", "check_backend", "choose_levels", "coarsen", "find_keys", "least_exponent", "make_blocks",
-    "max_spacing", "prepare", "resolve", "settle", "support_radius", "takes_triton", "with_autograd",
+    "BACKENDS", "MEAN_LIMIT", "SCALE_LIMITS", "SCALE_TOLERANCE", "Z_LIMIT", "Blocks", "Coarsened", "Kernel",
+    "SplatInputs", "bounding_tiles", "check_backend", "choose_levels", "coarsen", "find_keys", "least_exponent",
+    "make_blocks", "max_spacing", "resolve", "settle", "support_radius", "takes_triton", "warm_up", "with_autograd",
     "without_waiting",
 ]  # fmt: skip

@@ -56,8 +56,8 @@ class Kernel(NamedTuple):
     image: from the inputs to the image, with a graph of all orders; None: the kernel is differentiable once.
     error_gradients: from (plan, inputs, target) to the gradients of half the squared error against the target,
         (B, C, H, W), in one pass; None: there is none.
-    checks_values: `plan` returns None where a value is not finite or beyond the limits in whitened.py; else values have
-        been checked.
+    checks_values: `plan` returns None where a value is not finite or beyond the limits in whitened.py, and never else;
+        without, values have been checked.
     takes_one_image: Gaussians of one image may come without B, as do the results then; else B is there.
     looks_up_regions: `region_index` comes as region ids, with `ids`. `plan` returns None for negative ones, too;
         `foreign` of the plan is the number of those that the map does not hold.

@@ -22,15 +22,15 @@ _CHUNK_WEIGHTS = 1 << 22
 
 def kernel_for(inputs: SplatInputs) -> Kernel:
     """Return the kernel."""
-    return Kernel(lambda inputs: None, _render, _differentiate, splat)
+    return Kernel(lambda inputs: (), _render, _differentiate, splat)
 
 
-def _render(plan: None, inputs: SplatInputs) -> Tensor:
+def _render(plan: tuple[()], inputs: SplatInputs) -> Tensor:
     with torch.no_grad():
         return splat(inputs)
 
 
-def _differentiate(plan: None, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
+def _differentiate(plan: tuple[()], inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
     means, cholesky, colors = (t.detach() for t in inputs.gaussians)
     leaves = [t.requires_grad_() for t in ((means, cholesky, colors) if geometry else (colors,))]
     with with_autograd():

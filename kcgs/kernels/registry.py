@@ -27,7 +27,7 @@ def resolve(backend: str, inputs: SplatInputs) -> Kernel:
     return _kernel_for(name)(inputs)
 
 
-def prepare(backend: str, device: torch.device, dtype: torch.dtype, channels: int) -> None:
+def warm_up(backend: str, device: torch.device, dtype: torch.dtype, channels: int) -> None:
     """Render and differentiate once, before a clock starts, since much is compiled or loaded at first use."""
     image = _try(backend, device, dtype, channels)
     leaf = image.detach().requires_grad_()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,6 +23,9 @@ Z_LIMIT = 1e15
 MEAN_LIMIT = 1e8
 # least and largest l11 and l22, in pixels, for the same reason
 SCALE_LIMITS = (1e-6, 1e8)
+# by which the least may be missed, as numbers are rounded; and that bound for float32, as which all checks compare
+SCALE_TOLERANCE = 1e-6
+LEAST_SCALE = float(np.float32(SCALE_LIMITS[0] * (1 - SCALE_TOLERANCE)))
 
 # by the bytes of the dtype; exp() of less is zero there, or nothing beside the smallest colour step
 _LEAST_EXPONENT = {4: -80.0, 8: -700.0}

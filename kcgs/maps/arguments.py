@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from kcgs._labels import check_labels, is_label_source
 
-from .regions import RegionMap
+from .regions import RegionMap, wrap_labels
 from .table import MapTable
 
 
@@ -16,7 +17,9 @@ def as_region_map(value: object, name: str = "regions") -> RegionMap | None:
     if value is None or isinstance(value, RegionMap):
         return value
     if is_label_source(value):
-        return RegionMap(check_labels(name, value))
+        labels = check_labels(name, value)
+        with torch.inference_mode(False):  # a graph of autograd keeps no tensor of that mode
+            return wrap_labels(labels.clone(), 0.0)
     raise TypeError(f"{name} must be a RegionMap, a label map or None; got {type(value).__name__}")
 
 

@@ -60,4 +60,4 @@ def membership_at(table: MapTable, size: tuple[int, int]) -> Membership:
 
 def table_at(table: MapTable, size: tuple[int, int]) -> MapTable:
     """Return the table of a map at a size, with all that kernels read."""
-    return complete(table) if size == table.size else membership_at(table, size).tiles
+    return complete(table) if size == table.size else membership_at(table, size).tiled_table

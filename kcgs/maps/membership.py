@@ -26,7 +26,7 @@ class Membership:
         self.widths = table.widths
 
     @functools.cached_property
-    def tiles(self) -> MapTable:
+    def tiled_table(self) -> MapTable:
         """The table with the tiles of this membership."""
         return with_tiles(self.table)
 

@@ -113,7 +113,7 @@ class RegionMap:
 
     @property
     def ids(self) -> Tensor:
-        """The distinct ids, (R,) int64, sorted."""
+        """The distinct ids, (R,) int64, sorted; the map's own, not to be written to."""
         ids = self._table.ids
         assert ids is not None
         return ids
@@ -145,7 +145,7 @@ class RegionMap:
 
     @property
     def index(self) -> Tensor:
-        """Position of each pixel's label among `ids`, (B, H, W) int32, also for one map."""
+        """Position of each pixel's label among `ids`, (B, H, W) int32, also for one map; not to be written to."""
         return self._index
 
     @property
@@ -157,7 +157,7 @@ class RegionMap:
         """Return the position of each id among `ids`, -1 where the map does not hold it."""
         return positions_of(region_ids, self.ids)
 
-    def membership(self, region_ids: int | Iterable[int], dtype: torch.dtype = torch.float64) -> Tensor:
+    def membership(self, region_ids: int | Iterable[int] | Tensor, dtype: torch.dtype = torch.float64) -> Tensor:
         r"""Evaluate the membership of every pixel in a region, or the sum over several.
 
         Args:
@@ -177,8 +177,9 @@ class RegionMap:
         """
         if self.num_maps is not None:
             raise ValueError(f"membership needs one map; got a batch of {self.num_maps}")
-        ids = [region_ids] if isinstance(region_ids, int) else sorted(set(region_ids))
-        places = self.index_of(torch.tensor(ids, dtype=torch.int64, device=self.ids.device)).tolist()
+        if not isinstance(region_ids, Tensor):
+            region_ids = torch.tensor([*region_ids] if isinstance(region_ids, Iterable) else [region_ids])
+        places = self.index_of(region_ids.long().flatten().unique().to(self.ids.device)).tolist()
         table = table_at(self._table, self.size)
         parts = [full_map(table, 0, place) for place in places if place >= 0]
         black = torch.zeros(self.size, dtype=torch.float64, device=self.ids.device)

@@ -50,7 +50,7 @@ class SmoothMembership(Membership):
         return antialias(self.index, (self.source.variances < LEAST_BLUR**2).cpu())
 
     @functools.cached_property
-    def tiles(self) -> MapTable:
+    def tiled_table(self) -> MapTable:
         """The table with the tiles of the antialiased labels."""
         return with_smooth_tiles(self.table, self.smooth_labels)
 
@@ -87,7 +87,7 @@ class Resampled(Membership):
         self.ratio = math.prod(size) / math.prod(table.size)
 
     @functools.cached_property
-    def tiles(self) -> MapTable:
+    def tiled_table(self) -> MapTable:
         """The table at this size, made on the CPU."""
         return self.table.replace_tiles(part.to(self.index.device) for part in self._make_tiles())
 
@@ -132,7 +132,7 @@ class Resampled(Membership):
         counts = (len(self.index), *map(len, firsts))
         batch, row, col = torch.cartesian_prod(*map(torch.arange, counts)).unbind(1)
         corners = torch.stack([batch, firsts[0][row], firsts[1][col]], 1)
-        tile, region = find_windows(self.smooth.tiles, corners, spans)
+        tile, region = find_windows(self.smooth.tiled_table, corners, spans)
         is_shared = torch.bincount(tile)[tile] > 1
         shared = is_shared.nonzero().flatten()
         planes = torch.zeros(len(shared), TILE * TILE, dtype=torch.float64)
@@ -143,7 +143,7 @@ class Resampled(Membership):
             t, position = tile[pairs].unique_consecutive(return_inverse=True)
             y, x = down[row[t]], across[col[t]].mT
             exponent = sharpness(y @ _read(variances, corners[t], spans) @ x, self.ratio)
-            windows = cut_windows(self.smooth.tiles, corners[t[position]], region[pairs], spans)
+            windows = cut_windows(self.smooth.tiled_table, corners[t[position]], region[pairs], spans)
             planes[chunk] = _sharpen(y[position] @ windows @ x[position], position, exponent[position]).flatten(1)
         # some of a tile's regions have no weight there
         is_present = (planes > 0).any(1)

@@ -42,7 +42,7 @@ def find_tiles(regions: RegionMap | None, size: tuple[int, int]) -> Tiles:
     smooth = SmoothMembership(membership)
     # a window reaches into the tiles around it
     numbers = torch.arange(rows * cols)
-    tile, region = find_windows(smooth.tiles, _corners(numbers, cols), (WINDOW, WINDOW))
+    tile, region = find_windows(smooth.tiled_table, _corners(numbers, cols), (WINDOW, WINDOW))
     mixed = torch.bincount(tile)[tile] > 1
     windows = read_memberships(smooth, tile[mixed], cols, region[mixed])
     positive = windows.flatten(1).amax(1) > 0
@@ -62,7 +62,7 @@ def _corners(tile: Tensor, cols: int) -> Tensor:
 def read_memberships(membership: Membership, tile: Tensor, cols: int, region: Tensor) -> Tensor:
     """Read a region over the window of a tile, (P, WINDOW, WINDOW), for P pairs of both."""
     corners = _corners(tile, cols)
-    weights = cut_windows(membership.tiles, corners, region, (WINDOW, WINDOW))
+    weights = cut_windows(membership.tiled_table, corners, region, (WINDOW, WINDOW))
     down, across = (
         (begin[:, None] + torch.arange(WINDOW)).clamp(0, length - 1) - begin[:, None]
         for begin, length in zip(corners.unbind(1)[1:], membership.table.size, strict=True)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer
 from kcgs.functional import region_splat
+from kcgs.kernels.whitened import LEAST_SCALE
 from tests.tester import BaseTester
 
 # scenes here are drawn at random, with ids that their maps may lack
@@ -137,9 +138,24 @@ class TestRegionSplat(BaseTester):
             "means": torch.zeros(2, 2), "cholesky": torch.tensor([[1.0, 0.0, 1.0]] * 2), "colors": torch.zeros(2, 3),
             "region_ids": torch.tensor([0, 1]), "regions": torch.tensor([[0, 1]]),
         }  # fmt: skip
-        assert region_splat(**good).shape == (3, 1, 2)  # type: ignore[arg-type]
-        with pytest.raises(error, match=words):
-            region_splat(**{**good, **change})
+        for backend in ("auto", "cpu", "tiled", "reference"):
+            assert region_splat(**{**good, "backend": backend}).shape == (3, 1, 2)
+            with pytest.raises(error, match=words):
+                region_splat(**{**good, "backend": backend, **change})
+
+    @pytest.mark.parametrize("steps", range(-20, 8))
+    def test_all_backends_have_the_same_least_scale(self, steps: int) -> None:
+        """Around the limit, one float32 number after the other, a Gaussian renders or is refused, and never else."""
+        scale = torch.tensor(1e-6).view(torch.int32).add(steps).view(torch.float32)
+        cholesky = torch.stack([scale, torch.zeros(()), scale])[None]
+        verdicts = set()
+        for backend in ("cpu", "tiled", "reference"):
+            try:
+                region_splat(torch.ones(1, 2), cholesky, torch.ones(1, 3), size=(2, 2), backend=backend)
+                verdicts.add("renders")
+            except ValueError:
+                verdicts.add("refused")
+        assert verdicts == {"renders" if float(scale) >= LEAST_SCALE else "refused"}
 
     def test_feature(self, backend: str, device: torch.device, dtype: torch.dtype) -> None:
         """Three Gaussians, two regions, written out."""

@@ -13,19 +13,15 @@ from torch import Tensor
 
 from kcgs import RegionMap
 from kcgs.functional import region_splat
-from kcgs.maps import Membership, membership_at, table_and_size
+from kcgs.maps import Membership
 from kcgs.maps.nearest import spread
 from kcgs.maps.table import full_map
+
+from .label_maps import blobs, membership_of
 
 Widths = float | dict[tuple[int, int], float]
 PAIRS: dict[tuple[int, int], float] = {(0, 1): 0.7, (1, 2): 2.0, (0, 3): 1.1, (2, 3): 0.7}
 SIZE = (36, 60)
-
-
-def blobs(size: tuple[int, int] = SIZE, regions: int = 4, seed: int = 0, grain: int = 9) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    noise = torch.rand(1, regions, *size, generator=generator)
-    return torch.nn.functional.avg_pool2d(noise, grain, stride=1, padding=grain // 2).argmax(1)[0]
 
 
 def junction(size: tuple[int, int] = SIZE) -> Tensor:
@@ -39,13 +35,11 @@ def weights_of(membership: Membership) -> Tensor:
     return torch.stack([membership.weights(0, r, torch.float64) for r in range(membership.table.num_regions)])
 
 
-def membership_of(regions: RegionMap) -> Membership:
-    return membership_at(*table_and_size(regions))
-
-
 def from_table(membership: Membership, batch: int = 0) -> Tensor:
     """Weights of all regions of one map, put together from the table."""
-    return torch.stack([full_map(membership.tiles, batch, region) for region in range(membership.table.num_regions)])
+    return torch.stack(
+        [full_map(membership.tiled_table, batch, region) for region in range(membership.table.num_regions)]
+    )
 
 
 def width_of_pixels(labels: Any, widths: dict[tuple[int, int], float]) -> Any:
@@ -83,7 +77,7 @@ def blur(labels: Tensor, sigma: Any, region: int) -> Tensor:
 @pytest.mark.parametrize("seed", [0, 1])
 class TestDefinition:
     def test_pairs(self, seed: int) -> None:
-        labels = blobs(seed=seed)
+        labels = blobs(SIZE, seed=seed)
         membership = membership_of(RegionMap.from_labels(labels, PAIRS))
         sigma = width_of_pixels(labels.numpy(), PAIRS)
         assert set(np.unique(sigma)) == {0.0, 0.7, 1.1, 2.0}
@@ -92,7 +86,7 @@ class TestDefinition:
             assert (membership.weights(0, region, torch.float64) - expected).abs().max() < 1e-12
 
     def test_one_width(self, seed: int) -> None:
-        labels = blobs(seed=seed)
+        labels = blobs(SIZE, seed=seed)
         membership = membership_of(RegionMap.from_labels(labels, 0.9))
         for region in range(4):
             expected = blur(labels, np.full(labels.shape, 0.9), region)
@@ -110,7 +104,7 @@ class TestTables:
             assert (from_table(membership, batch) - torch.stack(dense)).abs().max() < 1e-7
 
     def test_sum_to_one(self, softness: Widths) -> None:
-        membership = membership_of(RegionMap.from_labels(blobs(), softness))
+        membership = membership_of(RegionMap.from_labels(blobs(SIZE), softness))
         weights = weights_of(membership)
         assert (weights.sum(0) - 1).abs().max() < 1e-12
         assert weights.min() >= 0
@@ -140,7 +134,7 @@ class TestPairWidths:
         labels = (torch.arange(60) // 20).expand(20, 60)  # 0 and 2 do not touch
         regions = RegionMap.from_labels(labels, {(0, 1): 0.7, (1, 2): 0.7, (0, 2): 3.0})
         assert membership_of(regions).widths == (0.7,)
-        table, plain = (membership_of(r).tiles.tiles for r in (regions, RegionMap.from_labels(labels, 0.7)))
+        table, plain = (membership_of(r).tiled_table.tiles for r in (regions, RegionMap.from_labels(labels, 0.7)))
         assert all(torch.equal(a, b) for a, b in zip(table, plain, strict=True))
 
     def test_contours_without_a_width_are_hard(self) -> None:
@@ -157,15 +151,15 @@ class TestPairWidths:
     def test_only_tiles_that_see_a_contour_have_masks(self) -> None:
         labels = torch.zeros(160, 160, dtype=torch.long)
         labels[:, 80:], labels[:, 144:] = 1, 2
-        table = membership_of(RegionMap.from_labels(labels, {(0, 1): 0.7})).tiles
+        table = membership_of(RegionMap.from_labels(labels, {(0, 1): 0.7})).tiled_table
         assert len(table.weights) == 2 * 20
         # between 1 and 2 no pixel is soft, and their contour is a border of tiles
         assert (table.planes < 0).sum() == 80
 
 
 def test_to(device: torch.device) -> None:
-    regions = RegionMap.from_labels(blobs(), PAIRS)
-    moved, expected = (membership_of(r).tiles.tiles for r in (regions.to(device), regions))
+    regions = RegionMap.from_labels(blobs(SIZE), PAIRS)
+    moved, expected = (membership_of(r).tiled_table.tiles for r in (regions.to(device), regions))
     assert all(a.device.type == device.type and torch.equal(a.cpu(), b) for a, b in zip(moved, expected, strict=True))
 
 

@@ -16,15 +16,11 @@ from torch import Tensor
 
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene, load
 from kcgs.functional import PairSoftness, edge_band, lookup_regions, region_splat
-from kcgs.maps import Membership, membership_at, table_and_size
+from kcgs.maps import table_and_size
 from kcgs.maps.table import full_map
 from tests.tester import BaseTester
 
-
-def blobs(size: tuple[int, int] = (45, 70), regions: int = 4, seed: int = 0) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    noise = torch.rand(1, regions, *size, generator=generator)
-    return torch.nn.functional.avg_pool2d(noise, 9, stride=1, padding=4).argmax(1)[0]
+from .label_maps import blobs, membership_of
 
 
 class TestRegionMap(
@@ -136,6 +132,15 @@ class TestRegionMap(
         assert len(moved) == 2 * 9
 
 
+def test_membership_of_ids_of_any_kind() -> None:
+    """One id counts once, however it is written."""
+    regions = RegionMap(torch.tensor([[3, 3, 7, 9]]))
+    three = regions.membership(3)
+    for ids in (np.int64(3), regions.ids[0], torch.tensor([3, 3]), np.array([3, 3]), {3}, (i for i in (3, 3, 99))):
+        assert torch.equal(regions.membership(ids), three)
+    assert not regions.membership([]).any()
+
+
 class TestPairSoftness:
     def test_one_value_for_every_pair_is_a_number(self) -> None:
         labels = torch.tensor([[3, 5, 9]])
@@ -171,7 +176,7 @@ class TestPairSoftness:
             assert other.softness == regions.softness and other.resize((44, 70)) is other
             assert other.size == other.labels.shape == (44, 70) and other.index.shape == (1, 44, 70)
         assert others[2].labels.device.type == "meta"
-        assert torch.equal(membership_of(others[0]).tiles.weights, membership_of(regions).tiles.weights)
+        assert torch.equal(membership_of(others[0]).tiled_table.weights, membership_of(regions).tiled_table.weights)
 
     @pytest.mark.parametrize(
         ("softness", "error", "words"),
@@ -221,7 +226,7 @@ class TestSoftnessOfEachMap:
         others = [pickle.loads(pickle.dumps(regions)), RegionMap.from_state(regions.state()), regions.resize((45, 70))]
         for other in [*others, load(tmp_path / "scenes.safetensors").regions]:
             assert other.softness == regions.softness
-            assert torch.equal(membership_of(other).tiles.weights, membership_of(regions).tiles.weights)
+            assert torch.equal(membership_of(other).tiled_table.weights, membership_of(regions).tiled_table.weights)
         assert RegionMap(labels, [0.7] * 4).softness == 0.7
         assert torch.equal(regions.merge([(0, 3)])[0].labels, torch.where(labels == 3, 0, labels))
 
@@ -247,10 +252,6 @@ class TestSoftnessOfEachMap:
 def test_pairs_of_a_batch_that_touch_anew_have_the_mean() -> None:
     regions = RegionMap(torch.tensor([[[1, 1, 2, 5]], [[1, 2, 2, 5]]]), {(1, 2): 0.6, (2, 5): 1.0})
     assert dict(regions.relabel(torch.tensor([[[1, 1, 2, 5]], [[1, 5, 2, 2]]]), "mean").softness)[1, 5] == 0.8
-
-
-def membership_of(regions: RegionMap) -> Membership:
-    return membership_at(*table_and_size(regions))
 
 
 def stated_antialiasing(labels: Tensor, x: int, y: int) -> tuple[int, float]:
@@ -360,7 +361,7 @@ class TestResize:
         regions = RegionMap.from_labels(labels, softness)
         resized = regions.resize(size)
         expected = stated_membership(labels, membership_of(regions).variances[0].sqrt(), size)
-        found = torch.stack([full_map(membership_of(resized).tiles, 0, region) for region in range(3)])
+        found = torch.stack([full_map(membership_of(resized).tiled_table, 0, region) for region in range(3)])
         assert (found - expected).abs().max() < 1e-6
         for region in range(3):
             weights = membership_of(resized).weights(0, region, torch.float64)
@@ -414,9 +415,9 @@ class TestResize:
     def test_copies_and_parts(self) -> None:
         regions = RegionMap.from_labels(torch.stack([blobs(seed=0), blobs(seed=1)]), 0.7)
         large = regions.resize((90, 140))
-        weights = membership_of(large).tiles.weights
+        weights = membership_of(large).tiled_table.weights
         for other in (pickle.loads(pickle.dumps(large)), copy.deepcopy(large), RegionMap.from_state(large.state())):
-            assert torch.equal(membership_of(other).tiles.weights, weights)
+            assert torch.equal(membership_of(other).tiled_table.weights, weights)
         expected = membership_of(large).weights(1, 2, torch.float64)
         torch.testing.assert_close(large[1].membership(2), expected, rtol=0, atol=1e-7)
 

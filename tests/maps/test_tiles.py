@@ -62,7 +62,7 @@ def membership_of(labels: Tensor, softness: Widths) -> Membership:
 def tiles_of(request: pytest.FixtureRequest) -> Callable[[Membership], Tiles]:
     """The tiles as any device makes them, and as the CPU does."""
     if request.param == "compiled":
-        return lambda membership: membership.tiles.tiles
+        return lambda membership: membership.tiled_table.tiles
     return lambda membership: tiles_on_device(
         membership.index, membership.table.num_regions, membership.widths, membership.table.width_index
     )
@@ -144,7 +144,7 @@ def test_widths_of_pixels(shape: tuple[int, int, int], values: list[float]) -> N
 @pytest.mark.parametrize("softness", [0.0, 0.7, pairs(4, [0.5, 0.0, 2.0])])
 def test_devices_agree(softness: Widths, device: torch.device) -> None:
     membership, moved = (membership_of(MAPS["batch"].to(d), softness) for d in ("cpu", device))
-    tiles, pixels = moved.tiles.tiles, moved.table.width_index
+    tiles, pixels = moved.tiled_table.tiles, moved.table.width_index
     contours = ContourWidths(moved.widths, None if pixels is None else pixels.cpu())
     check(tuple(part.cpu() for part in tiles), membership, contours)
 

@@ -10,7 +10,7 @@ from kcgs.compiled.program import inline, inner
 from kcgs.compiled.tasks import first_task, next_task
 
 from ..grid_columns import FIRST_TILE, NODE_COLS, NODE_ROWS, TILE_COLS, TILE_ROWS
-from ..whitened import MEAN_LIMIT, SCALE, SCALE_LIMITS
+from ..whitened import LEAST_SCALE, MEAN_LIMIT, SCALE, SCALE_LIMITS
 from .ellipse import block_rows, bounded, enter, row_halves, tile_rows
 from .layout import (
     CHANGE,
@@ -72,7 +72,7 @@ def arrange(batch, rows, cols):  # type: ignore[no-untyped-def]
 
 @inner
 def _in_range(means, cholesky, colors):  # type: ignore[no-untyped-def]
-    least, largest = SCALE_LIMITS[0] * (1 - 1e-6), SCALE_LIMITS[1]
+    least, largest = LEAST_SCALE, SCALE_LIMITS[1]
     is_valid = True
     for i in range(len(means)):  # written so that NaN fails
         is_valid &= abs(means[i, 0]) <= MEAN_LIMIT and abs(means[i, 1]) <= MEAN_LIMIT

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
 import torch
 import triton
 import triton.language as tl
@@ -19,7 +18,7 @@ from kcgs.maps import TILE, table_at
 
 from ..interface import SplatInputs
 from ..tiles import MARGIN, RELATIVE_MARGIN, TileGrid, grid_of
-from ..whitened import MEAN_LIMIT, SCALE_LIMITS, Z_LIMIT, support_radius
+from ..whitened import LEAST_SCALE, MEAN_LIMIT, SCALE_LIMITS, Z_LIMIT, support_radius
 from ..whitened import SCALE as EXPONENT_SCALE
 from .capacity import notes_of, remember, report, reports, reserve, room_for
 from .triton_function import triton_function
@@ -39,8 +38,7 @@ _REACH = tl.constexpr(1 + RELATIVE_MARGIN)
 _MARGIN = tl.constexpr(MARGIN)
 _Z_LIMIT = tl.constexpr(Z_LIMIT)
 _MEAN_LIMIT = tl.constexpr(MEAN_LIMIT)
-# as float32, which `check_values` compares with
-_LEAST_SCALE = tl.constexpr(float(np.float32(SCALE_LIMITS[0] * (1 - 1e-6))))
+_LEAST_SCALE = tl.constexpr(LEAST_SCALE)
 _MOST_SCALE = tl.constexpr(SCALE_LIMITS[1])
 
 # places in CudaPlan.counters, int64
