@@ -15,23 +15,24 @@ from kcgs.scene import Scene, check_scene
 
 @brief
 class PruneResult(NamedTuple):
-    """A scene with fewer Gaussians."""
+    """A scene with fewer Gaussians; of a batch, one number for each image."""
 
     scene: Scene
-    num_pruned: int
-    """Number of Gaussians that were removed."""
-    prune_error: float
-    """Largest change of a value of the image."""
+    num_pruned: int | Tensor
+    """Number of Gaussians that were removed, or (B,): that have the colour 0 now, and had another."""
+    prune_error: float | Tensor
+    """Largest change of a value of the image, or (B,)."""
 
 
 def prune(scene: Scene, tolerance: float = 1e-3, *, cutoff: float = 1e-4, backend: str = "auto") -> PruneResult:
     """Remove as many Gaussians as possible while no value of the image changes by more than `tolerance`.
 
     Gaussians that paint least go first. The tolerance bounds their sum: the image that all of them render, with the
-    absolute values of their colours, is nowhere above it.
+    absolute values of their colours, is nowhere above it. In a batch, whose images have as many rows, Gaussians keep
+    their row and get the colour 0.
 
     Args:
-        scene: unbatched.
+        scene: of one image, or a batch.
         tolerance: largest change of a value of the image, at least 0; 0 removes Gaussians that paint nothing.
         cutoff: of the renderer.
         backend: of the renderer.
@@ -40,7 +41,7 @@ def prune(scene: Scene, tolerance: float = 1e-3, *, cutoff: float = 1e-4, backen
         The scene that remains (no graph), the number of Gaussians removed, and the largest change, measured.
 
     Raises:
-        TypeError, ValueError: as the renderer; a batched scene; tolerance negative or not finite.
+        TypeError, ValueError: as the renderer; tolerance negative or not finite.
 
     Example:
         >>> from kcgs import GaussianField
@@ -51,17 +52,18 @@ def prune(scene: Scene, tolerance: float = 1e-3, *, cutoff: float = 1e-4, backen
         >>> result.num_pruned, result.prune_error
         (20, 0.0)
     """
-    check_scene(scene)
     tolerance = check_number("tolerance", tolerance, 0.0)
     render = RegionSplatRenderer(cutoff=cutoff, backend=backend)
+    if isinstance(scene, Scene) and scene.field.means.ndim == 3:
+        return _prune_batch(scene, tolerance, render)
+    check_scene(scene)
     total = scene.num_gaussians
     if scene.regions is not None and scene.field.region_ids is not None:
         scene = _subset(scene, scene.regions.index_of(scene.field.region_ids) >= 0)
     if scene.num_gaussians == 0:
         return PruneResult(_subset(scene, torch.zeros(0, dtype=torch.bool)), total, 0.0)
 
-    with torch.inference_mode(False), torch.enable_grad():
-        order = _effects(scene, render).argsort(stable=True)
+    order = _effects(scene, render).argsort(stable=True)
     magnitudes = _recolor(scene, scene.field.merged_colors().detach().abs())
     with torch.no_grad():
         low, high = 0, scene.num_gaussians  # the first `low` may go, the first `high + 1` may not
@@ -74,6 +76,29 @@ def prune(scene: Scene, tolerance: float = 1e-3, *, cutoff: float = 1e-4, backen
     return PruneResult(pruned, total - pruned.num_gaussians, change)
 
 
+def _prune_batch(scene: Scene, tolerance: float, render: RegionSplatRenderer) -> PruneResult:
+    """Do the same for all images at once."""
+    colors, regions, ids = scene.field.merged_colors().detach(), scene.regions, scene.field.region_ids
+    had_color = (colors != 0).any(-1)
+    if regions is not None and ids is not None:
+        colors = torch.where((regions.index_of(ids) >= 0)[..., None], colors, 0.0)
+    if colors.numel() == 0:
+        zeros = colors.new_zeros(len(colors))
+        return PruneResult(_recolor(scene, colors), zeros.long(), zeros)
+    rank = _effects(_recolor(scene, colors), render).argsort(stable=True).argsort()
+    with torch.no_grad():
+        low = torch.zeros_like(rank[:, 0])
+        high = torch.full_like(low, rank.shape[1])
+        while bool((low < high).any()):
+            middle = (low + high + 1) // 2
+            removed = torch.where((rank < middle[:, None])[..., None], colors.abs(), 0.0)
+            within = render(_recolor(scene, removed)).amax((1, 2, 3)) <= tolerance
+            low, high = torch.where(within, middle, low), torch.where(within, high, middle - 1)
+        pruned = _recolor(scene, torch.where((rank < low[:, None])[..., None], 0.0, colors))
+        change = (render(scene) - render(pruned)).abs().amax((1, 2, 3))
+    return PruneResult(pruned, (had_color & (pruned.field.colors == 0).all(-1)).sum(1), change)
+
+
 def _subset(scene: Scene, mask: Tensor) -> Scene:
     return Scene(scene.field.subset(mask), scene.regions, scene.metadata)
 
@@ -81,15 +106,18 @@ def _subset(scene: Scene, mask: Tensor) -> Scene:
 def _recolor(scene: Scene, colors: Tensor) -> Scene:
     field = scene.field
     means, cholesky = field.means.detach(), field.cholesky.detach()
-    return Scene(GaussianField(means, cholesky, colors, field.region_ids, size=field.size), scene.regions)
+    colored = GaussianField(means, cholesky, colors, field.region_ids, size=field.size)
+    return Scene(colored, scene.regions, scene.metadata)
 
 
+@torch.inference_mode(False)
+@torch.enable_grad()
 def _effects(scene: Scene, render: RegionSplatRenderer) -> Tensor:
-    """Bound each Gaussian's effect on a value, by its colour and by the sum of all that it paints, (N,)."""
+    """Bound each Gaussian's effect on a value, by its colour and by the sum of all that it paints, (..., N)."""
     colors = scene.field.merged_colors().detach().clone()
     probe = _recolor(scene, torch.ones_like(colors))
     probe.field.means.requires_grad_(False)
     probe.field.cholesky.requires_grad_(False)
     render(probe).sum().backward()
     assert probe.field.colors.grad is not None
-    return colors.abs().amax(-1) * probe.field.colors.grad[:, 0].clamp_max(1.0)
+    return colors.abs().amax(-1) * probe.field.colors.grad[..., 0].clamp_max(1.0)

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from kcgs import GaussianField, Scene
+from kcgs import GaussianField, RegionMap, Scene
 from kcgs.pruning import prune
 from tests.tester import BaseTester
 
@@ -50,6 +50,25 @@ class TestPrune(
             change = (scene() - result.scene()).abs().max()
         assert float(change) == result.prune_error <= tolerance + 1e-6
         assert result.scene.num_gaussians == 300 - result.num_pruned
+
+    @pytest.mark.parametrize("maps", [None, "one", "each"])
+    @pytest.mark.parametrize("tolerance", [0.0, 1e-2, 1e3])
+    def test_a_batch_is_as_each_image_alone(self, maps: str | None, tolerance: float) -> None:
+        """Gaussians keep their row, and those that go have the colour 0."""
+        labels = torch.stack([(torch.arange(60) >= x).long().expand(40, 60) for x in (20, 30, 40)])
+        regions = {None: None, "one": RegionMap(labels[0], 0.7), "each": RegionMap(labels, [0.7, 0.0, 1.2])}[maps]
+        own = [regions if regions is None or maps == "one" else regions[k] for k in range(3)]
+        fields = [GaussianField.random(200, (40, 60), regions=one, seed=k) for k, one in enumerate(own)]
+        for k, field in enumerate(fields):
+            field.colors.data *= torch.logspace(-6 + k, 0, 200)[:, None]
+        result = prune(Scene(GaussianField.stack(fields), regions, {"title": "three"}), tolerance)
+        assert result.scene.metadata == {"title": "three"} and len(result.scene) == 3
+        for k, (field, one) in enumerate(zip(fields, own, strict=True)):
+            alone = prune(Scene(field, one), tolerance)
+            stays = (result.scene.field.colors[k] != 0).any(-1)
+            assert int(result.num_pruned[k]) == alone.num_pruned and float(result.prune_error[k]) == alone.prune_error
+            assert torch.equal(result.scene.field.colors[k][stays], alone.scene.field.colors)
+            assert torch.equal(result.scene.field.means[k], field.means)
 
     def test_a_larger_tolerance_removes_more(self, scene: Scene) -> None:
         counts = [prune(scene, tolerance=t).num_pruned for t in (0.0, 1e-3, 1e-1, 1e3)]

@@ -34,7 +34,8 @@ def finish(state: FitState, reason: str, clock: Clock) -> FitResult:
     assert state.best is not None
     scene, num_pruned, prune_error = state.best, 0, 0.0
     if config.prune > 0:
-        scene, num_pruned, prune_error = prune(scene, config.prune, cutoff=config.cutoff, backend=config.backend)
+        pruned = prune(scene, config.prune, cutoff=config.cutoff, backend=config.backend)
+        scene, num_pruned, prune_error = pruned.scene, int(pruned.num_pruned), float(pruned.prune_error)
     report = report_regions(problem.regions, scene, dropped=None if config.guidance else "recipe")
     return FitResult(
         scene, state.history, reason, config, num_pruned, prune_error, report, clock.seconds(), state.best_psnr
