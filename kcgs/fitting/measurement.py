@@ -6,7 +6,6 @@ import copy
 
 import torch
 from torch import Tensor
-from torch.nn.functional import mse_loss
 
 from kcgs.scene import Scene
 
@@ -21,22 +20,28 @@ def snapshot(state: FitState, seconds: float) -> Measurement:
 
 
 def measure_errors(problem: Problem, rendered: Tensor) -> Tensor:
-    """Return the errors of a render, (C, H, W), see `Errors`, (3,), on its device and without waiting for it."""
+    """Return the errors of a render, see `Errors`, (3,) or for a batch (B, 3), on its device, which nobody waits for.
+
+    Args:
+        problem: of the image, (C, H, W), or of a batch of them.
+        rendered: of the same shape.
+    """
     objective, image, rendered = problem.objective, problem.image, rendered.detach()
     if image is not None and image.is_cpu:
         from .measurement_loops import mean_errors  # loads numba
 
-        arrays = [tensor.numpy() for tensor in (rendered, image, problem.band)]
-        means = [*mean_errors(*arrays, is_squared=objective.power != 1)]
+        render_array, image_array = (tensor.reshape(-1, *tensor.shape[-3:]).numpy() for tensor in (rendered, image))
+        means = mean_errors(render_array, image_array, problem.band.numpy(), is_squared=objective.power != 1)
+        errors = torch.from_numpy(means).reshape(*rendered.shape[:-3], 3)
         if objective.power is None:
-            means[0] = float(objective.value(rendered))
-        return torch.tensor(means, dtype=torch.float64)
+            errors[..., 0] = objective.value(rendered)
+        return errors
     value = objective.value(rendered)
-    error = band_error = value.new_full((), torch.nan)
+    error = band_error = torch.full_like(value, torch.nan)
     if image is not None:
-        clipped = rendered.clamp(0.0, 1.0)
-        error = mse_loss(clipped, image).to(value)
-        if len(problem.band):
-            y, x = problem.band.unbind(1)
-            band_error = mse_loss(clipped[:, y, x], image[:, y, x]).to(value)
-    return torch.stack([value, error, band_error])
+        square = (rendered.clamp(0.0, 1.0) - image).square()
+        error = square.mean((-3, -2, -1)).to(value)
+        if (near := problem.band_mask) is not None:
+            count = near.sum((-3, -2, -1)) * square.shape[-3]
+            band_error = ((square * near).sum((-3, -2, -1)) / count).to(value)
+    return torch.stack([value, error, band_error], -1)

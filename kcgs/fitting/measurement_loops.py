@@ -17,17 +17,17 @@ _COLUMNS = 64
 _THREAD_PIXELS = 1 << 16
 
 
-def mean_errors(rendered: Any, image: Any, band: Any, *, is_squared: bool) -> tuple[float, float, float]:
-    """Return the mean error of a render (C, H, W), absolute or squared, and the mean squared error once it is clipped.
+def mean_errors(rendered: Any, image: Any, band: Any, *, is_squared: bool) -> Any:
+    """Return for each image of renders (B, C, H, W) three means, (B, 3).
 
-    The third is that of the pixels whose rows and columns `band` lists (M, 2), or NaN.
+    They are the mean error, absolute or squared; the mean squared error once the render is clipped; and the latter of
+    the pixels whose image, row and column `band` lists, (M, 3), in the order of images, or NaN.
     """
-    _, height, width = rendered.shape
-    loss, squares = np.zeros(width), np.zeros(width)
+    batch, _, height, width = rendered.shape
+    loss, squares = np.zeros((batch, width)), np.zeros((batch, width))
     loop = partial(_sum_columns, rendered, image, is_squared, loss, squares)
-    run_tasks(loop, ranges(width, _COLUMNS), 1 + height * width // _THREAD_PIXELS)
-    means: tuple[float, float, float] = _mean(rendered, image, band, loss, squares)
-    return means
+    run_tasks(loop, ranges(batch * width, _COLUMNS), 1 + batch * height * width // _THREAD_PIXELS)
+    return _mean(rendered, image, band, loss, squares)
 
 
 @inner
@@ -37,25 +37,38 @@ def _clipped_error(value, target):  # type: ignore[no-untyped-def]
 
 @program.entry
 def _sum_columns(rendered, image, is_squared, loss, squares, tasks, counters):  # type: ignore[no-untyped-def]
-    """Add up the errors of each column; tasks are ranges of columns."""
-    channels, height, _ = rendered.shape
+    """Add up the errors of each column; tasks are ranges of columns, which are numbered through all images."""
+    _, channels, height, width = rendered.shape
     k = first_task(tasks, counters)
     while k >= 0:
-        for c in range(channels):
-            for y in range(height):
-                for x in range(tasks[k, 1], tasks[k, 2]):
-                    difference = rendered[c, y, x] - image[c, y, x]
-                    loss[x] += difference * difference if is_squared else abs(difference)
-                    squares[x] += _clipped_error(rendered[c, y, x], image[c, y, x])
+        first, last = tasks[k, 1], tasks[k, 2] - 1
+        for b in range(first // width, last // width + 1):
+            begin, end = max(first - b * width, 0), min(last + 1 - b * width, width)
+            for c in range(channels):
+                for y in range(height):
+                    for x in range(begin, end):
+                        difference = rendered[b, c, y, x] - image[b, c, y, x]
+                        loss[b, x] += difference * difference if is_squared else abs(difference)
+                        squares[b, x] += _clipped_error(rendered[b, c, y, x], image[b, c, y, x])
         k = next_task(tasks, counters, k)
 
 
 @program.entry
 def _mean(rendered, image, band, loss, squares):  # type: ignore[no-untyped-def]
-    """Return the means of columns, and that of the band."""
-    inside = 0.0
-    for c in range(len(rendered)):
-        for i in range(len(band)):
-            y, x = band[i]
-            inside += _clipped_error(rendered[c, y, x], image[c, y, x])
-    return loss.sum() / rendered.size, squares.sum() / rendered.size, inside / (len(rendered) * len(band))
+    """Return the means of columns, and those of the band."""
+    batch, channels, height, width = rendered.shape
+    means = np.empty((batch, 3))
+    first = 0
+    for b in range(batch):
+        end = first
+        while end < len(band) and band[end, 0] == b:
+            end += 1
+        inside = 0.0
+        for c in range(channels):
+            for i in range(first, end):
+                y, x = band[i, 1], band[i, 2]
+                inside += _clipped_error(rendered[b, c, y, x], image[b, c, y, x])
+        values = channels * height * width
+        means[b] = loss[b].sum() / values, squares[b].sum() / values, inside / (channels * (end - first))
+        first = end
+    return means

@@ -54,7 +54,7 @@ class Problem:
     @property
     def size(self) -> tuple[int, int]:
         """(height, width) of the render."""
-        return self.canvas.shape[1], self.canvas.shape[2]
+        return self.canvas.shape[-2], self.canvas.shape[-1]
 
     @property
     def device(self) -> torch.device:
@@ -77,10 +77,16 @@ class Problem:
 
     @cached_property
     def band(self) -> Tensor:
-        """Rows and columns (M, 2) of the pixels near a contour of the user's map, for EF-PSNR."""
-        if self.regions is None:
-            return torch.empty(0, 2, dtype=torch.int64, device=self.device)
-        return edge_band(self.regions.labels).nonzero().contiguous()
+        """Image, row and column (M, 3) of the pixels near a contour of the user's map, for EF-PSNR."""
+        mask = self.band_mask
+        if mask is None:
+            return torch.empty(0, 3, dtype=torch.int64, device=self.device)
+        return mask.reshape(-1, *self.size).nonzero().contiguous()
+
+    @cached_property
+    def band_mask(self) -> Tensor | None:
+        """The same pixels as a mask, (..., 1, H, W); None without a map."""
+        return None if self.regions is None else edge_band(self.regions.labels).unsqueeze(-3)
 
     @property
     def num_excess_regions(self) -> int:

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import l1_loss, mse_loss
 
 from kcgs.errors import InvalidArgument
 
@@ -21,14 +20,14 @@ _NUM_STEPS = 10
 
 
 class Residual(NamedTuple):
-    """What a render lacks, times the root of each pixel's weight, by which proposed colours are divided."""
+    """What a render lacks: `error` is weighted, and the colours of Gaussians that are proposed for it go by `root`."""
 
-    error: Tensor  # [C, H, W], its square is what a Gaussian may gain
-    root: Tensor | float = 1.0  # [H, W]
+    error: Tensor  # [..., C, H, W], its square is what a Gaussian may gain
+    root: Tensor | float = 1.0  # [..., H, W], root of each pixel's weight, by which colours are divided
 
 
 class Objective(ABC):
-    """What a descent lowers: a function of the render, with its slope."""
+    """What a descent lowers: a function of the render, (..., C, H, W), with its slope; of a batch for each image."""
 
     is_ranked_by_psnr = True
     """The best state of a descent has the highest PSNR; False: the lowest value."""
@@ -37,7 +36,7 @@ class Objective(ABC):
 
     @abstractmethod
     def slope(self, render: Tensor) -> Tensor:
-        """Return the gradient at a render, (C, H, W), whose memory this method may overwrite, times a positive factor.
+        """Return the gradient at a render, whose memory this method may overwrite, times a positive factor.
 
         The gradient is that of the value times the number of values. The factor is one half for the objectives of
         Newton's method, the squared error and MS-SSIM; Adam ignores it.
@@ -45,15 +44,15 @@ class Objective(ABC):
 
     @abstractmethod
     def value(self, render: Tensor) -> Tensor:
-        """Return the mean error of a render, (C, H, W), as a scalar on its device."""
+        """Return the mean error of a render as a scalar on its device, or (B,)."""
 
     @abstractmethod
     def residual(self, render: Tensor) -> Residual:
-        """Return what a render, (C, H, W), lacks."""
+        """Return what a render lacks."""
 
     def weigh(self, gaussians: Gaussians) -> Tensor:
-        """Return about what the squared error of each Gaussian weighs, (N,)."""
-        return torch.ones_like(gaussians.means[:, 0])
+        """Return about what the squared error of each Gaussian weighs, (..., N)."""
+        return torch.ones_like(gaussians.means[..., 0])
 
     def has_fused_gradients(self, renderer: Renderer) -> bool:
         """Whether gradients need no render of their own."""
@@ -74,7 +73,7 @@ class Objective(ABC):
 
 
 class ImageObjective(Objective):
-    """An error of a render against an image, (C, H, W); subclasses say of which kind."""
+    """An error of a render against an image, (..., C, H, W); subclasses say of which kind."""
 
     def __init__(self, image: Tensor) -> None:
         self.image = image
@@ -99,9 +98,8 @@ class SquaredError(ImageObjective):
 
     def value(self, render: Tensor) -> Tensor:
         """Return the mean squared error."""
-        if self.weight is None:
-            return mse_loss(render, self.image)
-        return (self.weight * (render - self.image).square()).mean()
+        square = (render - self.image).square()
+        return (square if self.weight is None else self.weight * square).mean((-3, -2, -1))
 
     def has_fused_gradients(self, renderer: Renderer) -> bool:
         """Whether the error is that of all pixels of the render as it is."""
@@ -125,7 +123,7 @@ class AbsoluteError(ImageObjective):
 
     def value(self, render: Tensor) -> Tensor:
         """Return the mean absolute error."""
-        return l1_loss(render, self.image)
+        return (render - self.image).abs().mean((-3, -2, -1))
 
 
 class LossObjective(Objective):

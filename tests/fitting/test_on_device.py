@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable, Iterator
@@ -14,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from kcgs import FitConfig, fit
+from kcgs import FitConfig, RegionMap, fit
 from kcgs.fitting import FitResult, fit_problem
 from kcgs.fitting.events import contours
 from kcgs.fitting.measurement import measure_errors
@@ -91,6 +92,27 @@ def test_the_errors_of_a_render_are_those_of_the_cpu() -> None:
         assert device.num_waits == before[1] and (objective == "l1+ssim" or device.num_operations < before[0] + 20)
         assert torch.equal(errors.content, first.content)
         torch.testing.assert_close(errors.content, expected, check_dtype=False)
+
+
+@pytest.mark.parametrize("objective", ["l1", "l2", "l1+ssim"])
+@pytest.mark.parametrize("has_maps", [False, True])
+def test_the_errors_of_a_batch_are_those_of_each_image(objective: str, has_maps: bool) -> None:
+    """On a CPU bit for bit; on a device up to the order of sums."""
+    images = torch.stack([image(), image().flip(1), image().flip(2)])
+    renders = images + 0.4 * torch.randn(images.shape, generator=torch.Generator().manual_seed(0))
+    labels = torch.stack([(torch.arange(40) > x).long().expand(32, 40) for x in (5, 20, 50)]) if has_maps else None
+    config = FitConfig(objective=objective)
+    maps = [None] * 3 if labels is None else list(labels)
+    problems = [make_problem(one, own, 10, config, 0) for one, own in zip(images, maps, strict=True)]
+    expected = torch.stack([measure_errors(*pair) for pair in zip(problems, renders, strict=True)])
+    batch = dataclasses.replace(problems[0], canvas=images, regions=None if labels is None else RegionMap(labels))
+    torch.testing.assert_close(measure_errors(batch, renders), expected, rtol=0, atol=0, equal_nan=True)
+    device = AbsentDevice()
+    with device.use():
+        regions = None if batch.regions is None else batch.regions.to("meta")
+        on_device = dataclasses.replace(batch, canvas=DeviceTensor(images), regions=regions)
+        errors = measure_errors(on_device, DeviceTensor(renders))
+    torch.testing.assert_close(errors.content, expected, check_dtype=False, equal_nan=True)
 
 
 def test_steps_that_are_not_waited_for_are_those_that_are() -> None:

@@ -21,8 +21,8 @@ class AbsoluteAndSsim(AbsoluteError):
         """Return the gradient, times the number of values."""
         leaf = render.clone().requires_grad_()
         with torch.enable_grad():
-            (slope,) = torch.autograd.grad(ssim(leaf, self.image), leaf)
-        return super().slope(render).sub_(_SSIM_WEIGHT * leaf.numel() * slope)
+            (slope,) = torch.autograd.grad(ssim(leaf, self.image).sum(), leaf)
+        return super().slope(render).sub_(_SSIM_WEIGHT * leaf.shape[-3:].numel() * slope)
 
     def value(self, render: Tensor) -> Tensor:
         """Return the weighted sum."""
