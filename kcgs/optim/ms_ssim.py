@@ -39,7 +39,7 @@ class MsSsim(ImageObjective):
     is half the gradient of E itself.
 
     Args:
-        image: (C, H, W) in [0, 1].
+        image: (C, H, W) in [0, 1], or a batch of them.
         reduction: factor by which the sides of a photo were reduced to those of the image. Its scales keep their
             weights, so the finest ones are left out; the squared error has ten times the weight.
 
@@ -61,14 +61,19 @@ class MsSsim(ImageObjective):
             plane = halve(plane)
             if not plane.numel():
                 break
-            inside = 1.0 / _blur(torch.ones_like(plane[:1]))
+            inside = 1.0 / _blur(image.new_ones(1, *plane.shape[-2:]))
             mean, square = (inside * _blur(t) for t in (plane, plane * plane))
-            variance, weight = (square - mean * mean).clamp_min(0.0), weight / mean[0].numel()
+            variance, weight = (square - mean * mean).clamp_min(0.0), weight / plane.shape[-2:].numel()
             self._scales.append((plane, inside, mean, variance, weight))
-            masks.append(_blur(inside * weight / (2.0 * variance + K2**2)).mean(0))
-        self._norm = sum(float(mask.mean()) for mask in masks)
-        masks = [torch.full_like(image[0], self._squared), *(mask / self._norm for mask in masks)]
-        self.importance = self._sum_up([mask[None] * 0.25**level for level, mask in enumerate(masks)])[0]
+            masks.append(_blur(inside * weight / (2.0 * variance + K2**2)).mean(-3))
+        # of each image, in float64
+        self._norm = image.new_zeros(image.shape[:-3], dtype=torch.float64)
+        for mask in masks:
+            self._norm += mask.mean((-2, -1))
+        black = torch.full_like(image[..., 0, :, :], self._squared)
+        masks = [black, *(mask / self._norm_of(mask) for mask in masks)]
+        parts = [mask.unsqueeze(-3) * 0.25**level for level, mask in enumerate(masks)]
+        self.importance = self._sum_up(parts).squeeze(-3)
         self._bands = [(0, 0.0, math.inf, masks[0])]
         for level, mask in enumerate(masks[1:], 1):
             # the mean under the window is no part of contrast and structure
@@ -76,15 +81,21 @@ class MsSsim(ImageObjective):
             self._bands.append((level, blocks, blocks + window, mask))
         if self._scales:
             _, inside, mean, _, weight = self._scales[-1]
-            bright = _blur(inside * weight / self._norm / (2.0 * mean * mean + K1**2)).mean(0)
+            bright = _blur(inside * weight / self._norm_of(mean) / (2.0 * mean * mean + K1**2)).mean(-3)
             self._bands.append((level, blocks + window, math.inf, bright))
         self._passes: Passes | None = None
         if self._scales and image.device.type == "cpu" and image.dtype == torch.float32:
             from .similarity import Passes  # loads numba
 
             factors = [weight / self._norm * 0.25**level for level, (*_, weight) in enumerate(self._scales, 1)]
-            scales = [[plane.numpy() for plane in planes] for *planes, _ in self._scales]
-            self._passes = Passes(scales, factors, _MIN_SCORE)  # the compiled form of `_measure`
+            scales = [[plane.reshape(-1, *plane.shape[-2:]).numpy() for plane in planes] for *planes, _ in self._scales]
+            table = torch.stack(factors).reshape(len(factors), -1).numpy()
+            self._passes = Passes(scales, table, _MIN_SCORE)  # the compiled form of `_measure`
+
+    def _norm_of(self, planes: Tensor) -> Tensor:
+        """Return Z of each image, in the shape and precision of planes."""
+        lead = self._norm.shape
+        return self._norm.view(*lead, *[1] * (planes.ndim - len(lead))).to(planes.dtype) if lead else self._norm
 
     def slope(self, render: Tensor) -> Tensor:
         """Return half the gradient of E.
@@ -97,25 +108,27 @@ class MsSsim(ImageObjective):
         if self._passes is None:
             return self._measure(difference)[1]
         gradient = difference.contiguous()
-        self._passes.differentiate(gradient.numpy(), self._squared)
+        self._passes.differentiate(gradient.view(-1, *gradient.shape[-2:]).numpy(), self._squared)
         return gradient
 
     def value(self, render: Tensor) -> Tensor:
-        """Return E of a render that is clipped to [0, 1], as a mean over pixels and channels, in float64."""
+        """Return E of a render that is clipped to [0, 1], as a mean over pixels and channels, in float64; or (B,)."""
         difference = render.clamp(0.0, 1.0) - self.image
         if self._passes is None:
             total = self._measure(difference)[0].double()
         else:
-            total = torch.tensor(self._passes.value(difference.contiguous().numpy()), dtype=torch.float64)
-        return total / difference[0].numel() + self._squared * difference.square().mean().double()
+            planes = difference.contiguous().view(-1, *difference.shape[-2:])
+            total = torch.from_numpy(self._passes.value(planes.numpy())).view(difference.shape[:-3])
+        squared = difference.square().mean((-3, -2, -1)).double()
+        return total / difference.shape[-2:].numel() + self._squared * squared
 
     def residual(self, render: Tensor) -> Residual:
         """Return each pixel's gradient by the root of what it counts: the square is what a Gaussian may gain."""
         root = self.importance.sqrt()
-        return Residual(-self._slope(render - self.image) / root, root)
+        return Residual(-self._slope(render - self.image) / root.unsqueeze(-3), root)
 
     def weigh(self, gaussians: Gaussians) -> Tensor:
-        """Return about what the squared error of Gaussians counts in E, by their places and sizes, (N,)."""
+        """Return about what the squared error of Gaussians counts in E, by their places and sizes, (..., N)."""
         l11, l21, l22 = gaussians.cholesky.detach().unbind(-1)
         xx, xy, yy = l11**2, l11 * l21, l21**2 + l22**2
         x, y = gaussians.means.detach().floor().long().unbind(-1)
@@ -126,15 +139,15 @@ class MsSsim(ImageObjective):
             return l11 * l22 / ((xx + variance) * (yy + variance) - xy**2).sqrt()
 
         for level, fine, coarse, mask in self._bands:
-            row, column = (
-                (place >> level).clamp(0, length - 1) for place, length in zip((y, x), mask.shape, strict=True)
-            )
-            total += 0.25**level * mask[row, column] * (energy_after(fine) - energy_after(coarse))
+            height, width = mask.shape[-2:]
+            pixels = (y >> level).clamp(0, height - 1) * width + (x >> level).clamp(0, width - 1)
+            at_centres = mask.flatten(-2).gather(-1, pixels)
+            total += 0.25**level * at_centres * (energy_after(fine) - energy_after(coarse))
         return total
 
     def _measure(self, difference: Tensor) -> tuple[Tensor, Tensor]:
         """Return E without the squared error, as a sum over pixels, and half the gradient of all of E."""
-        total, gradients, plane = difference.new_zeros(()), [self._squared * difference], difference
+        total, gradients, plane = difference.new_zeros(difference.shape[:-3]), [self._squared * difference], difference
         for level, (image, inside, mean, variance, weight) in enumerate(self._scales, 1):
             plane = halve(plane)
             render = image + plane
@@ -147,13 +160,13 @@ class MsSsim(ImageObjective):
                 means = mean * mean + render_mean * render_mean + K1**2
                 luminance = (2.0 * mean * render_mean + K1**2) / means
                 luminance_slope = structure * (luminance * render_mean - mean) / means
-            windows = (structure * luminance)[:, ::2, ::2]
-            score = windows.mean((1, 2)).clamp_min(_MIN_SCORE)
-            total -= weight / self._norm * mean[0].numel() * score.log().mean()
+            windows = (structure * luminance)[..., ::2, ::2]
+            score, area = windows.mean((-2, -1)).clamp_min(_MIN_SCORE), mean.shape[-2:].numel()
+            total -= (weight / self._norm * area).to(total) * score.log().mean(-1)
             # of windows at even rows and columns, for all
             share = torch.zeros_like(plane)
-            factor = weight / self._norm * 0.25**level * mean.numel() / windows.numel()
-            share[:, ::2, ::2] = inside[:, ::2, ::2] * factor / score[:, None, None]
+            factor = (weight / self._norm * 0.25**level * area / windows.shape[-2:].numel()).to(share)
+            share[..., ::2, ::2] = inside[:, ::2, ::2] * factor.view(*factor.shape, 1, 1, 1) / score[..., None, None]
             by_product = share * luminance / variances
             by_square = by_product * structure
             by_mean = by_product * mean - by_square * render_mean + share * luminance_slope
@@ -164,9 +177,9 @@ class MsSsim(ImageObjective):
     def _sum_up(planes: list[Tensor]) -> Tensor:
         """Add to each plane what the blocks of the coarser ones have; the planes are written to."""
         for fine, coarse in zip(planes[-2::-1], planes[:0:-1], strict=True):
-            height, width = coarse.shape[1:]
-            blocks = fine[:, : 2 * height, : 2 * width].unflatten(2, (width, 2)).unflatten(1, (height, 2))
-            blocks.add_(coarse[:, :, None, :, None])
+            height, width = coarse.shape[-2:]
+            blocks = fine[..., : 2 * height, : 2 * width].unflatten(-1, (width, 2)).unflatten(-3, (height, 2))
+            blocks.add_(coarse[..., :, None, :, None])
         return planes[0]
 
 

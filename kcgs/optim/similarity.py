@@ -21,17 +21,17 @@ _ROWS = 64
 
 
 class Passes:
-    """The objective and its gradient at differences from one image.
+    """The objective and its gradient at differences from an image, or from each of a batch.
 
     Args:
-        scales: of each scale the image, (C, h, w), the inverse of the window's part inside of it, (1, h, w), mean and
-            variance under the window, (C, h, w).
-        factors: weight of each scale, by the gradient's norm.
+        scales: of each scale the images, (B C, h, w), the inverse of the window's part inside of them, (1, h, w), mean
+            and variance under the window, (B C, h, w).
+        factors: weight of each scale, by the gradient's norm, of each image, (S, B).
         least: least mean score of a scale.
     """
 
-    def __init__(self, scales: Sequence[Sequence[NDArray[Any]]], factors: Sequence[float], least: float) -> None:
-        self._channels = len(scales[0][0])
+    def __init__(self, scales: Sequence[Sequence[NDArray[Any]]], factors: NDArray[Any], least: float) -> None:
+        self._channels, self._num_images = len(scales[0][0]), factors.shape[1]
         sizes = np.array([scale[0].shape[1:] for scale in scales])
         padded_sizes = sizes + np.array([PADDING, 2 * MARGIN])
         areas = np.column_stack([side.prod(1) for side in (sizes, padded_sizes, (sizes + 1) // 2)])
@@ -42,7 +42,7 @@ class Passes:
             np.concatenate([scale[k][:, ::2, ::2].ravel() for scale in scales]) for k in (1, 2, 3)
         )
         # the weight of a pixel is for windows at all pixels
-        weights = np.array(factors) * areas[:, 0] / areas[:, 2]
+        weights = (factors.repeat(self._channels // factors.shape[1], 1).T * areas[:, 0] / areas[:, 2]).T.copy()
         render, planes = np.zeros_like(image), np.empty(self._channels * areas[:, 0].sum(), np.float32)
         settings = table, self._channels, weights, least, taps
         self._scales = Scales(*settings, image, inside, mean, variance, render, planes)
@@ -58,17 +58,21 @@ class Passes:
         firsts = range(0, height, _ROWS)
         return np.array([(scale, c, y, min(y + _ROWS, height)) for c in range(self._channels) for y in firsts])
 
-    def value(self, difference: NDArray[Any]) -> float:
-        """Return what MS-SSIM lacks, as its weighted logarithm, summed over pixels and averaged over channels."""
+    def value(self, difference: NDArray[Any]) -> NDArray[Any]:
+        """Return what MS-SSIM lacks, as its weighted logarithm, summed over pixels and averaged over channels, (B,)."""
         sums, table = self._run(difference, self._value_tasks), self._scales.table
         scores = np.zeros((len(table), self._channels))
         np.add.at(scores, (self._value_tasks[:, SCALE], self._value_tasks[:, CHANNEL]), sums)
         windows = ((table[:, [HEIGHT, WIDTH]] + 1) // 2).prod(1)
-        logs = np.log(np.maximum(scores / windows[:, None], self._scales.least)).mean(1)
-        return -float((self._scales.factors * 4.0 ** np.arange(1, len(table) + 1) * windows * logs).sum())
+        logs = np.log(np.maximum(scores / windows[:, None], self._scales.least))
+        logs = logs.reshape(len(table), self._num_images, -1).mean(2)
+        factors = self._scales.factors[:, :: self._channels // self._num_images]
+        areas = 4.0 ** np.arange(1, len(table) + 1)[:, None]
+        totals: NDArray[Any] = -(factors * areas * windows[:, None] * logs).sum(0)
+        return totals
 
     def differentiate(self, difference: NDArray[Any], squared: float) -> None:
-        """Replace a difference, (C, H, W), contiguous float32, by half the gradient and `squared` times itself."""
+        """Replace a difference, (B C, H, W), contiguous float32, by half the gradient and `squared` times itself."""
         self._run(difference, self._tasks, squared)
 
     def _run(self, difference: NDArray[Any], tasks: Any, squared: float = 0.0) -> NDArray[Any]:

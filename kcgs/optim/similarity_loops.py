@@ -35,14 +35,14 @@ program = Program("objective of MS-SSIM")
 
 
 class Scales(NamedTuple):
-    """All scales of an image, flat, finest first.
+    """All scales of an image or a batch, flat, finest first.
 
     Windows lie at even rows and columns. Zeros lie around `padded` planes: 5 rows above and 7 below, 5 columns beside.
     """
 
     table: Any  # [S, 5] int64
-    channels: int  # C
-    factors: Any  # [S] float64: weight of a window by the gradient's norm
+    channels: int  # C, of a batch all of all images
+    factors: Any  # [S, C] float64: weight of a window by the gradient's norm
     least: float  # least mean score of a scale
     taps: Any  # [6] of the window, its centre first
     image: Any  # padded, C
@@ -280,7 +280,7 @@ def _sum(scales, difference, squared, sums, tasks, k):  # type: ignore[no-untype
     first, last = tasks[k, FIRST], tasks[k, LAST]
     nothing = np.empty(0, np.float32)
     for scale in range(len(table) - 1, -1, -1):
-        factor = np.float32(scales.factors[scale] / _mean_score(scales, sums, tasks, scale, channel))
+        factor = np.float32(scales.factors[scale, channel] / _mean_score(scales, sums, tasks, scale, channel))
         plane = _plane(scales, scale, channel)
         has_coarse = scale + 1 < len(table)
         coarse = _plane(scales, scale + has_coarse, channel)

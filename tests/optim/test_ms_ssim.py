@@ -75,6 +75,27 @@ class TestMsSsim:
             g = 1e-4 * torch.exp(-0.5 * ((x - 60.5) ** 2 + (y - 90.5) ** 2) / sigma**2).expand(3, -1, -1).double()
             assert float(weight) == pytest.approx(float(objective.value(image + g) / g.square().mean()), rel=0.35)
 
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    @pytest.mark.parametrize("size", [(1, 1), (21, 30), (70, 90)])
+    def test_a_batch_is_as_each_image_alone(self, size: tuple[int, int], dtype: torch.dtype) -> None:
+        """In float32, on a CPU, bit for bit: Z is that of each image."""
+        images, residuals = (torch.stack([photo(*size, seed=s + k) for k in range(3)]).to(dtype) for s in (0, 5))
+        images[1] = 0.5
+        renders, tolerance = images + 0.1 * residuals, 0.0 if dtype == torch.float32 else 1e-12
+        batch, alone = MsSsim(images), [MsSsim(image) for image in images]
+        gaussians = Gaussians(
+            torch.rand(3, 7, 2) * 20, torch.tensor([3.0, 0.0, 3.0]).expand(3, 7, 3), torch.ones(3, 7, 3)
+        )
+        for k, one in enumerate(alone):
+            own = Gaussians(*(table[k] for table in gaussians[:3]))
+            for actual, expected in (
+                (batch.value(renders)[k], one.value(renders[k])),
+                (batch.slope(renders.clone())[k], one.slope(renders[k].clone())),
+                (batch.residual(renders).error[k], one.residual(renders[k]).error),
+                (batch.weigh(gaussians)[k], one.weigh(own)),
+            ):
+                torch.testing.assert_close(actual, expected, rtol=tolerance, atol=tolerance)
+
     @pytest.mark.parametrize("size", [(1, 1), (1, 9), (21, 30), (22, 30), (50, 47), (283, 39)])
     def test_compiled(self, size: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
         """Float32 is compiled: it agrees with float64, at all sizes and on any number of threads."""

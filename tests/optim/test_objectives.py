@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kcgs.fitting.published.ssim_loss import AbsoluteAndSsim
-from kcgs.optim import AbsoluteError, LossObjective, Objective, SquaredError
+from kcgs.optim import AbsoluteError, ImageObjective, LossObjective, Objective, SquaredError
 
 IMAGE = torch.rand(3, 24, 40, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 RENDER = 0.8 * IMAGE + 0.1 + 0.05 * torch.rand(3, 24, 40, generator=torch.Generator().manual_seed(1)).double()
@@ -48,6 +48,17 @@ def test_values_with_a_power_are_means_of_it(kind: type[SquaredError | AbsoluteE
     assert objective.power == power
     torch.testing.assert_close(objective.value(RENDER), (RENDER - IMAGE).abs().pow(power).mean())
     assert SquaredError(IMAGE, WEIGHT).power is None and AbsoluteAndSsim(IMAGE).power is None
+
+
+@pytest.mark.parametrize("kind", [SquaredError, AbsoluteError, AbsoluteAndSsim])
+def test_a_batch_is_as_each_image_alone(kind: type[ImageObjective]) -> None:
+    images, renders = torch.stack([IMAGE, IMAGE.flip(1)]).float(), torch.stack([RENDER, 1 - RENDER]).float()
+    batch = kind(images)
+    values, slopes = batch.value(renders), batch.slope(renders.clone())
+    for k in range(2):
+        alone = kind(images[k])
+        torch.testing.assert_close(values[k], alone.value(renders[k]))
+        torch.testing.assert_close(slopes[k], alone.slope(renders[k].clone()), atol=1e-5, rtol=1e-5)
 
 
 class TestLoss:
