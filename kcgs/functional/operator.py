@@ -38,7 +38,7 @@ _LIBRARY.define(f"region_splat_backward({_BACKWARD}) -> (Tensor, Tensor, Tensor)
 _LIBRARY.define(f"region_splat_double_backward({_TANGENTS}, {_BACKWARD}) -> (Tensor, Tensor, Tensor, Tensor)")
 _LIBRARY.define(f"region_splat_forward({_TANGENTS}, {SCHEMA}) -> Tensor")
 
-_THIRD = "region_splat is differentiable twice: torch.autograd.functional.vhp needs no third derivative, as hvp does"
+_THIRD = "region_splat is differentiable twice: take vhp of torch.autograd.functional, not hvp, which needs a third"
 
 # as Python calls them
 splat_operator: Any = torch.ops.kcgs.region_splat.default

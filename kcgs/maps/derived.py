@@ -1,7 +1,7 @@
 """What is made of a map's table when it is first needed: the map at other sizes, and a kernel's arrays.
 
-The rule: it is kept as long as a RegionMap keeps the table, so it must not hold the table's `starts`. What is made of
-labels alone is not kept.
+The rule: a result lives as long as the tensor `starts` of the table that it was made of, so it must not hold that
+tensor. What is made of labels alone, which have no `starts` yet, is not kept.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ _LISTED_BYTES = 24
 def tiles_on_device(
     index: Tensor, num_regions: int, widths: Sequence[float] = (0.0,), width_index: Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the last four fields of a `MapTable` on the device of a map.
+    """Return the `TILE_FIELDS` of a `MapTable` on the device of a map.
 
     Args:
         index: position of each pixel's region among the sorted ids, (maps, H, W) int32.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,10 +18,11 @@ TILE = 16  # pixels along a side
 class MapTable(NamedTuple):
     """A label map as tensors; of labels alone the others are None, until `with_positions` and `with_tiles` make them.
 
-    The last four say which regions occur in which tile of 16 pixels, and the membership of its pixels where a tile has
+    `TILE_FIELDS` say which regions occur in which tile of 16 pixels, and the membership of its pixels where a tile has
     several. Tiles are numbered in raster order, map first. Weights beyond the image have no meaning.
 
-    To add a field, add it here: the operator's schema and arguments follow.
+    To add a field, add it here, and to `PER_MAP` or `SHARED` where it cannot be made of the others: the operator's
+    schema, arguments and vmap follow.
     """
 
     labels: Tensor  # [H, W] or [maps, H, W] int64; nobody writes to those of a RegionMap
@@ -58,23 +59,26 @@ class MapTable(NamedTuple):
 
     @property
     def tiles(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The last four fields, of a table that has them."""
-        starts, regions, planes, weights = self[5:]
+        """`TILE_FIELDS` of a table that has them."""
+        starts, regions, planes, weights = self.starts, self.regions, self.planes, self.weights
         assert starts is not None and regions is not None and planes is not None and weights is not None
         return starts, regions, planes, weights
 
     def replace_tiles(self, tiles: Iterable[Tensor | None]) -> MapTable:
-        """Return the table with other tiles."""
-        return MapTable(*self[:5], *tiles)
+        """Return the table with other tiles, in the order of `TILE_FIELDS`."""
+        fields: dict[str, Any] = dict(zip(TILE_FIELDS, tiles, strict=True))
+        return self._replace(**fields)
 
     def without_tiles(self) -> MapTable:
-        """Return the table without the last four fields."""
-        return self.replace_tiles([None] * 4)
+        """Return the table without its tiles."""
+        return self.replace_tiles([None] * len(TILE_FIELDS))
 
 
-# fields that have a part for each map, from which all others but `blurs` can be made anew
+# what all other fields can be made of: fields that have a part for each map, and those that all maps share
 PER_MAP = ("labels", "width_index")
 SHARED = ("blurs",)
+# the regions of tiles, and the membership of their pixels
+TILE_FIELDS = ("starts", "regions", "planes", "weights")
 
 
 def with_positions(table: MapTable) -> MapTable:

@@ -22,7 +22,7 @@ _FAR = 1 << 24
 _NO_KEY = 1 << 62
 
 
-Softness = float | Mapping[tuple[int, int], float]
+SoftnessByPosition = float | Mapping[tuple[int, int], float]
 
 
 class ContourWidths(NamedTuple):
@@ -59,7 +59,9 @@ def blurs_of(widths: Sequence[float], device: torch.device) -> Tensor:
     return torch.cat([width, truncated_gaussian(distance, width)], 1).to(device, non_blocking=True)
 
 
-def find_widths(index: Tensor, num_regions: int, softness: Softness | tuple[Softness, ...]) -> ContourWidths:
+def find_widths(
+    index: Tensor, num_regions: int, softness: SoftnessByPosition | tuple[SoftnessByPosition, ...]
+) -> ContourWidths:
     """Give each pixel the width of its nearest contour, on the map's device, which the host does not wait for.
 
     The nearest pixel that touches a contour has the same label: the way to another label crosses the contour earlier.
