@@ -20,7 +20,7 @@ def snapshot(state: FitState, seconds: float) -> Measurement:
 
 
 def measure_errors(problem: Problem, rendered: Tensor) -> Tensor:
-    """Return the errors of a render, see `Errors`, (3,) or for a batch (B, 3), on its device, which nobody waits for.
+    """Return the errors of a render, see `Errors`, (3,) or for a batch (B, 3), on its device and without a host sync.
 
     Args:
         problem: of the image, (C, H, W), or of a batch of them.

@@ -82,10 +82,10 @@ def propose_gaussians(
     count, backend = check_count("num_gaussians", num_gaussians), check_backend(backend)
     if batch is None:
         return propose(error, map_of_error, count, backend=backend)
-    pairs = zip(error, map_of_each(map_of_error, batch), strict=True)
-    fields = [propose(one, of_one, count, backend=backend) for one, of_one in pairs]
+    maps = map_of_each(map_of_error, batch)
+    fields = [propose(one, of_one, count, backend=backend) for one, of_one in zip(error, maps, strict=True)]
     most = max(field.num_gaussians for field in fields)
-    return GaussianField.stack([pad_rows(field, most) for field in fields])
+    return GaussianField.stack([pad_rows(field, most, of_one) for field, of_one in zip(fields, maps, strict=True)])
 
 
 def propose(residual: Tensor, regions: RegionMap | None, count: int, *, backend: str = "auto") -> GaussianField:

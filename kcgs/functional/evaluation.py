@@ -38,7 +38,7 @@ def prepare(arguments: SplatArguments, check: bool = True) -> Evaluation:
 
 
 def _refuse(arguments: SplatArguments, inputs: SplatInputs) -> NoReturn:
-    """Say which value a kernel, which returned no plan, does not take."""
+    """Raise the error of the value for which a kernel returned no plan."""
     check_values(*arguments[:3])
     _check_ids(inputs)
     raise AssertionError("a kernel refuses values that pass the checks")

@@ -89,7 +89,7 @@ def with_positions(table: MapTable) -> MapTable:
     if not labels.is_cpu:
         check_labels("regions", labels)
     ids, positions = compact(labels)
-    if labels.is_cpu and int(ids.numpy()[0]) < 0:  # on a CPU the least id says it, and pixels are not read once more
+    if labels.is_cpu and int(ids.numpy()[0]) < 0:  # the least id, in place of another pass over the pixels
         check_labels("regions", labels)
     return table._replace(ids=ids, positions=positions.view(table.shape))
 

@@ -321,14 +321,16 @@ def join(first: GaussianField, second: GaussianField) -> GaussianField:
     return GaussianField(means, cholesky, concatenate(first.colors, second.colors), ids, opacities, size=first.size)
 
 
-def pad_rows(field: GaussianField, count: int) -> GaussianField:
+def pad_rows(field: GaussianField, count: int, regions: RegionMap | None) -> GaussianField:
     """Return a field of one image, without opacities, with rows of the colour 0 up to a number, and without the graph.
 
-    They are of the region of the first Gaussian, or of region 0 where there is none.
+    With a map, the rows are of its first region, and so are all Gaussians of a field without ids.
     """
     missing = (0, 0, 0, count - field.num_gaussians)
     means, cholesky = (pad(table.detach(), missing, value=1.0) for table in (field.means, field.cholesky))
-    ids = field.region_ids
-    if ids is not None:
-        ids = torch.cat([ids, (ids[:1] if len(ids) else ids.new_zeros(1)).expand(missing[3])])
+    ids = None
+    if regions is not None:
+        ids = regions.ids[:1].expand(count).clone()
+        if field.region_ids is not None:
+            ids[: field.num_gaussians] = field.region_ids
     return GaussianField(means, cholesky, pad(field.colors.detach(), missing), ids, size=field.size)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, pad
+from torch.nn.functional import avg_pool2d
 
 from kcgs._check import check_count
 from kcgs._objectives import objective_for
@@ -20,7 +20,7 @@ from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
 from kcgs.fitting import FitConfig, check_image_and_regions, fit
 from kcgs.functional import RegionMap, lookup_regions
-from kcgs.nn import GaussianField
+from kcgs.nn import pad_rows
 from kcgs.optim import Gaussians
 from kcgs.scene import Scene
 
@@ -150,15 +150,8 @@ class _VideoFit:
         if self.frames:  # contours have the softness of the first frame
             config = config.model_copy(update={"softness": 0.0})
         scene = fit(self.image, regions, self.num_gaussians, recipe=config, seed=self.seed).scene
-        means, cholesky, colors, region_ids = Gaussians.of(scene.field)
-        unused = (0, 0, 0, self.num_gaussians - scene.num_gaussians)
-        means, cholesky, colors = pad(means, unused, value=1.0), pad(cholesky, unused, value=1.0), pad(colors, unused)
         regions = scene.regions or regions  # a fit removes a map of one region
-        if regions is not None:
-            fitted_ids, region_ids = region_ids, regions.ids[:1].expand(self.num_gaussians).clone()
-            if fitted_ids is not None:
-                region_ids[: len(fitted_ids)] = fitted_ids
-        return Scene(GaussianField(means, cholesky, colors, region_ids, size=scene.size), regions)
+        return Scene(pad_rows(scene.field, self.num_gaussians, regions), regions)
 
     def _follow(self, flow: Tensor, regions: RegionMap | None) -> tuple[Scene, Tensor]:
         """Return a frame, fitted from the one before, and the mask of the pixels that changed."""

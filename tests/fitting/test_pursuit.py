@@ -26,6 +26,7 @@ def test_a_batch_is_as_each_image_alone(has_maps: bool) -> None:
     """Where an image finds fewer Gaussians than others, its last rows have the colour 0."""
     errors = torch.stack([noise(3, (32, 40), seed=0), torch.zeros(3, 32, 40), 0.1 * noise(3, (32, 40), 9, seed=1)])
     labels = torch.stack([(torch.arange(40) >= x).long().expand(32, 40) for x in (10, 20, 30)]) if has_maps else None
+    labels = None if labels is None else labels + 4  # the padding is of a region that there is
     batch = propose_gaussians(errors, 60, labels)
     alone = [propose_gaussians(e, 60, None if labels is None else labels[k]) for k, e in enumerate(errors)]
     assert alone[1].num_gaussians < batch.num_gaussians == max(field.num_gaussians for field in alone)
@@ -33,6 +34,7 @@ def test_a_batch_is_as_each_image_alone(has_maps: bool) -> None:
         for expected, actual in zip(tensors(field), tensors(batch), strict=True):
             assert torch.equal(actual[k, : len(expected)], expected)
         assert not batch.colors[k, field.num_gaussians :].any()
+        assert labels is None or torch.isin(batch.region_ids[k], labels[k]).all()
 
 
 def noise(channels: int, size: tuple[int, int], smooth: int = 3, seed: int = 0) -> Tensor:
