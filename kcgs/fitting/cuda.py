@@ -13,23 +13,25 @@ _PIXELS = 512
 
 
 def blur(planes: Tensor, labels: Tensor | None, sigma: float, norm_sigma: float, reach: int) -> Tensor:
-    """Filter planes, (K, H, W), along columns, then along rows, each time over the pixels of the same label alone.
+    """Filter planes of images along columns, then along rows, each time over the pixels of the same label alone.
 
     Args:
-        planes: contiguous float32, on a CUDA device.
-        labels: (H, W), contiguous; None: all pixels are of one.
+        planes: (B, K, H, W), contiguous float32, on a CUDA device.
+        labels: (B, H, W), or (1, H, W) for all images, contiguous; None: all pixels are of one.
         sigma: standard deviation of the filter, in pixels.
         norm_sigma: that of the last plane's.
         reach: of both filters, in pixels.
     """
-    count, height, width = planes.shape
+    batch, count, height, width = planes.shape
+    area = height * width
     for stride, length in ((width, height), (1, width)):
         blurred = torch.empty_like(planes)
         with torch.cuda.device_of(planes):
             # without labels any address will do: it is not read
             _blur(
-                (-(-height * width // _PIXELS), count),
-                planes, planes if labels is None else labels, blurred, height * width, stride, length,
+                (-(-area // _PIXELS), count, batch),
+                planes, planes if labels is None else labels, blurred, area, stride, length,
+                0 if labels is None or len(labels) == 1 else area,
                 -0.5 / sigma**2, -0.5 / norm_sigma**2, reach, MAPPED=labels is not None,
                 PIXELS=_PIXELS,
             )  # fmt: skip
@@ -39,7 +41,7 @@ def blur(planes: Tensor, labels: Tensor | None, sigma: float, norm_sigma: float,
 
 @triton_function(warps=4)
 def _blur(  # type: ignore[no-untyped-def]
-    planes, labels, blurred, area, stride, length, exponent, norm_exponent, reach,
+    planes, labels, blurred, area, stride, length, labels_per_image, exponent, norm_exponent, reach,
     MAPPED: tl.constexpr, PIXELS: tl.constexpr,
 ):  # fmt: skip
     pixel = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
@@ -47,8 +49,10 @@ def _blur(  # type: ignore[no-untyped-def]
     place = pixel // stride % length
     plane = tl.program_id(1)
     scale = tl.where(plane == tl.num_programs(1) - 1, norm_exponent, exponent)
-    first = plane.to(tl.int64) * area
+    image = tl.program_id(2).to(tl.int64)
+    first = (image * tl.num_programs(1) + plane) * area
     total = tl.zeros([PIXELS], tl.float32)
+    labels += image * labels_per_image
     if MAPPED:
         label = tl.load(labels + pixel, mask=inside, other=0.0)
     for distance in range(-reach, reach + 1):

@@ -14,10 +14,11 @@ from torch.nn.functional import max_pool2d, pad
 from kcgs._check import check_count, check_floating
 from kcgs.functional import RegionMap, halve, lookup_regions, region_splat
 from kcgs.kernels import check_backend, takes_triton
-from kcgs.nn import GaussianField, pad_rows
+from kcgs.maps import pixels_under
+from kcgs.nn import GaussianField
 from kcgs.optim import Objective, Renderer
 
-from .checks import map_of_each, regions_of
+from .checks import regions_of
 from .state import FitState
 
 # Standard deviations that are tried, in pixels, by the side of the blocks that the residual is averaged over for them.
@@ -33,12 +34,12 @@ _CUTOFF = 1e-4
 
 
 class _Scale(NamedTuple):
-    """Gains and colours of Gaussians of one size, each alone, at the middle of each block of an image."""
+    """Gains and colours of Gaussians of one size, each alone, at the middle of each block of images."""
 
     sigma: float  # pixels
     block: int  # side of the blocks, pixels
-    gain: Tensor  # [h, w], fall of the squared error
-    colors: Tensor  # [C, h, w], of least squares
+    gain: Tensor  # [B, h, w], fall of the squared error
+    colors: Tensor  # [B, C, h, w], of least squares
 
 
 def propose_gaussians(
@@ -80,65 +81,130 @@ def propose_gaussians(
     batch = len(error) if error.ndim == 4 else None
     map_of_error = regions_of(tuple(error.shape[-2:]), regions, batch)
     count, backend = check_count("num_gaussians", num_gaussians), check_backend(backend)
-    if batch is None:
-        return propose(error, map_of_error, count, backend=backend)
-    maps = map_of_each(map_of_error, batch)
-    fields = [propose(one, of_one, count, backend=backend) for one, of_one in zip(error, maps, strict=True)]
-    most = max(field.num_gaussians for field in fields)
-    return GaussianField.stack([pad_rows(field, most, of_one) for field, of_one in zip(fields, maps, strict=True)])
+    return propose(error, map_of_error, count, backend=backend)
 
 
+class _Proposals(NamedTuple):
+    """Gaussians of a batch, one after the other."""
+
+    image: Tensor  # [M], to which each belongs
+    means: Tensor  # [M, 2]
+    cholesky: Tensor  # [M, 3]
+    colors: Tensor  # [M, C]
+
+    def select(self, rows: Tensor) -> _Proposals:
+        """Return those of an index or a mask."""
+        return _Proposals(*(column[rows] for column in self))
+
+    def by_image(self, batch: int) -> tuple[_Proposals, Tensor]:
+        """Return them in the order of images, and the place of each among those of its image."""
+        proposals = self.select(self.image.sort(stable=True)[1])
+        counts = proposals.image.bincount(minlength=batch)
+        firsts = counts.cumsum(0) - counts
+        return proposals, torch.arange(len(proposals.image), device=counts.device) - firsts[proposals.image]
+
+    def rows(self, batch: int) -> list[Tensor]:
+        """Return means, factors and colours of each image, (B, K, ...), where rows without a Gaussian have colour 0."""
+        proposals, place = self.by_image(batch)
+        most = int(place.max()) + 1 if len(place) else 0
+        tables = [
+            column.new_full((batch, most, column.shape[1]), fill)
+            for column, fill in zip(proposals[1:], (1.0, 1.0, 0.0), strict=True)
+        ]
+        for table, column in zip(tables, proposals[1:], strict=True):
+            table[proposals.image, place] = column
+        return tables
+
+
+@torch.no_grad()
 def propose(residual: Tensor, regions: RegionMap | None, count: int, *, backend: str = "auto") -> GaussianField:
     """Do what `propose_gaussians` does, with arguments that are checked; `count` may be 0."""
     residual = residual.detach()
+    is_batch, size = residual.ndim == 4, (residual.shape[-2], residual.shape[-1])
+    residual = residual if is_batch else residual[None]
     # below this the gain is rounding error: one pixel's, at the precision of the largest
-    floor = (128 * torch.finfo(residual.dtype).eps * float(residual.abs().max())) ** 2
-    size = residual.shape[1], residual.shape[2]
-    parts = [[residual.new_zeros(0, columns) for columns in (2, 3, len(residual))]]
-    region_ids = [] if regions is None else [regions.ids[:0]]
-    missing = count
-    with torch.no_grad():
-        while missing > 0:
-            gain, means, sigma, colors = _local_maxima(residual, regions, floor)
-            if not len(gain):
-                break
-            strongest = gain.sort(descending=True, stable=True)[1][:missing]
-            means, sigma, colors = means[strongest], sigma[strongest], colors[strongest]
-            cholesky = torch.stack([sigma, torch.zeros_like(sigma), sigma], -1)
-            ids = None if regions is None else lookup_regions(means, regions.labels)
-            rendered = region_splat(means, cholesky, colors, ids, regions, size=size, cutoff=_CUTOFF, backend=backend)
-            # Gaussians overlap: a step of the best length makes the fall of the error certain
-            length = rendered.flatten().dot(residual.flatten()) / rendered.flatten().dot(rendered.flatten())
-            if not bool(length > 0):
-                break
-            parts.append([means, cholesky, colors * length])
-            region_ids += [] if ids is None else [ids]
-            residual, missing = torch.addcmul(residual, rendered, length, value=-1.0), missing - len(means)
-    means, cholesky, colors = (torch.cat(rows) for rows in zip(*parts, strict=True))
-    return GaussianField(means, cholesky, colors, torch.cat(region_ids) if region_ids else None, size=size)
+    largest = residual.abs().amax((1, 2, 3)).double()
+    floor = (128 * torch.finfo(residual.dtype).eps * largest).square()
+    missing = torch.full_like(floor, count, dtype=torch.int64)
+    batch = len(residual)
+    rounds = [_Proposals(missing[:0], *(residual.new_zeros(0, columns) for columns in (2, 3, residual.shape[1])))]
+    while bool((missing > 0).any()):
+        candidates = _strongest(residual, regions, floor, missing)
+        if not len(candidates.image):
+            break
+        means, cholesky, colors = candidates.rows(batch)
+        ids = None if regions is None else lookup_regions(means, regions.labels)
+        rendered = region_splat(means, cholesky, colors, ids, regions, size=size, cutoff=_CUTOFF, backend=backend)
+        # Gaussians overlap: a step of the best length makes the fall of the error certain
+        length = _products(rendered, residual) / _products(rendered, rendered)
+        is_useful = length > 0
+        length = torch.where(is_useful, length, 0.0)
+        candidates = candidates.select(is_useful[candidates.image])
+        rounds.append(candidates._replace(colors=candidates.colors * length[candidates.image, None]))
+        residual = torch.addcmul(residual, rendered, length.view(-1, 1, 1, 1), value=-1.0)
+        missing = torch.where(is_useful, missing - candidates.image.bincount(minlength=batch), 0)
+    proposals = _Proposals(*(torch.cat(columns) for columns in zip(*rounds, strict=True)))
+    means, cholesky, colors = proposals.rows(batch)
+    ids = None if regions is None else lookup_regions(means, regions.labels)
+    field = GaussianField(means, cholesky, colors, ids, size=size)
+    return field if is_batch else field[0]
+
+
+def _products(first: Tensor, second: Tensor) -> Tensor:
+    """Return the sum of the products of values, of each image."""
+    pairs = zip(first.flatten(1), second.flatten(1), strict=True)
+    # on a CPU each image gets the bits that it gets alone
+    return torch.stack([a.dot(b) for a, b in pairs]) if first.is_cpu else (first * second).sum((1, 2, 3))
 
 
 def propose_for(objective: Objective, rendered: Tensor, renderer: Renderer, count: int) -> GaussianField:
-    """Find at most `count` Gaussians that lower an objective of a render, (C, H, W), most: see `propose`."""
+    """Find at most `count` Gaussians that lower an objective of each render, (..., C, H, W), most: see `propose`."""
     error, root = objective.residual(rendered)
     added = propose(error, renderer.regions, count, backend=renderer.backend)
     if isinstance(root, Tensor):
-        x, y = added.means.detach().long().unbind(-1)
-        added.colors.data = added.colors.detach() / root[y, x, None]
+        y, x = pixels_under(added.means.detach(), renderer.size)
+        pixels = y * renderer.size[1] + x
+        added.colors.data = added.colors.detach() / root.flatten(-2).gather(-1, pixels)[..., None]
     return added
 
 
 def add_gaussians(state: FitState, count: int) -> None:
-    """Add at most so many Gaussians to a fit, if any, that lower its objective most."""
+    """Add at most so many Gaussians to each image of a fit, if any, that lower its objective most.
+
+    An image with use for fewer than others gets rows of the colour 0, which stay as they are.
+    """
     if count > 0:
-        added = propose_for(state.objective, state.render().detach(), state.renderer, count)
+        before, rendered = state.num_gaussians, state.render().detach()
+        added = propose_for(state.objective, rendered, state.renderer, count)
+        unused = (added.colors.detach() == 0).all(-1)
         state.optimizer.append(state.field, added)
+        if bool(unused.any()):
+            state.optimizer.freeze(state.field, pad(unused, (before, 0)))
 
 
-def _local_maxima(residual: Tensor, regions: RegionMap | None, floor: float) -> tuple[Tensor, ...]:
-    """Return gain, mean, sigma and colours of each Gaussian that gains more than all others of any size nearby."""
-    labels = None if regions is None else regions.index[0].to(residual.dtype)
-    best, factors, block = torch.zeros_like(residual[0]), _scatter(residual[0]), 1
+def _strongest(residual: Tensor, regions: RegionMap | None, floor: Tensor, missing: Tensor) -> _Proposals:
+    """Return the strongest local maxima of each image, at most as many as it misses, the strongest first."""
+    active = missing.nonzero()[:, 0]  # images
+    index = None if regions is None else regions.index
+    if index is not None and len(index) > 1:
+        index = index[active]
+    image, gain, means, sigma, colors = _local_maxima(residual[active], index, floor[active])
+    cholesky = torch.stack([sigma, torch.zeros_like(sigma), sigma], -1)
+    proposals = _Proposals(active[image], means, cholesky, colors).select(gain.sort(descending=True, stable=True)[1])
+    proposals, place = proposals.by_image(len(missing))
+    return proposals.select(place < missing[proposals.image])
+
+
+def _local_maxima(residual: Tensor, index: Tensor | None, floor: Tensor) -> tuple[Tensor, ...]:
+    """Return image, gain, mean, sigma and colours of each Gaussian that gains more than all others of any size nearby.
+
+    Args:
+        residual: (B, C, H, W).
+        index: of each pixel's region, (B, H, W), or (1, H, W) for all images.
+        floor: gain from which on one counts, (B,).
+    """
+    labels = None if index is None else index.to(residual.dtype)
+    best, factors, block = torch.zeros_like(residual[:, 0]), _scatter(residual[0, 0]), 1
     scales, parts = [], []
     for scale in _scales(residual, labels):
         middles = _middles(best, scale.block)
@@ -150,18 +216,20 @@ def _local_maxima(residual: Tensor, regions: RegionMap | None, floor: float) -> 
     for sigma, side, gain, colors in scales:
         while block < side:
             best, block = _halve_by_maximum(best), 2 * block
-        highest = _pool(best, round(_RADIUS * sigma / block))[: len(gain), : gain.shape[1]]
-        rows, columns = torch.nonzero((gain >= highest) & (gain > floor), as_tuple=True)
+        highest = _pool(best, round(_RADIUS * sigma / block))[:, : gain.shape[1], : gain.shape[2]]
+        is_highest = (gain >= highest) & (gain > floor.to(gain)[:, None, None])
+        image, rows, columns = torch.nonzero(is_highest, as_tuple=True)
         means = (torch.stack([columns, rows], -1) + 0.5).to(gain.dtype) * block
-        parts.append((gain[rows, columns], means, means.new_full((len(means),), sigma), colors[:, rows, columns].T))
+        colors_there = colors[image, :, rows, columns]
+        parts.append((image, gain[is_highest], means, means.new_full((len(means),), sigma), colors_there))
     return tuple(torch.cat(columns) for columns in zip(*parts, strict=True))
 
 
 def _scales(residual: Tensor, labels: Tensor | None) -> Iterator[_Scale]:
-    """Evaluate each size of Gaussians, as long as the image has a block of it."""
-    pixels = torch.cat([residual, torch.ones_like(residual[:1])])
+    """Evaluate each size of Gaussians, as long as the images have a block of it."""
+    pixels = torch.cat([residual, torch.ones_like(residual[:, :1])], 1)
     for block, sigmas in _SIGMAS.items():
-        if min(residual.shape[1:]) < block:
+        if min(residual.shape[2:]) < block:
             return
         planes = _average(pixels, labels, block)
         middle_labels = None if labels is None else _middles(labels, block).contiguous()
@@ -180,14 +248,14 @@ def _scatter(plane: Tensor) -> Tensor:
     return (row[:, None] + column).frac_().mul_(-_SCATTER).add_(1.0)
 
 
-def _middles(plane: Tensor, block: int) -> Tensor:
-    """Return the view of the pixel in the middle of each whole block, of four the last."""
-    height, width = (length // block * block for length in plane.shape)
-    return plane[block // 2 : height : block, block // 2 : width : block]
+def _middles(planes: Tensor, block: int) -> Tensor:
+    """Return the view of the pixel in the middle of each whole block of (..., H, W), of four the last."""
+    height, width = (length // block * block for length in planes.shape[-2:])
+    return planes[..., block // 2 : height : block, block // 2 : width : block]
 
 
 def _average(planes: Tensor, labels: Tensor | None, block: int) -> Tensor:
-    """Return the means of whole blocks, whose side is a power of 2.
+    """Return the means of whole blocks of (B, K, H, W), whose side is a power of 2.
 
     Of a block that a contour crosses, pixels that differ in label from its middle count as 0.
     """
@@ -197,19 +265,20 @@ def _average(planes: Tensor, labels: Tensor | None, block: int) -> Tensor:
 
             return average(planes, labels, block)
         middles = _middles(labels, block)
-        height, width = (length * block for length in middles.shape)
-        blocks = labels[:height, :width].unflatten(1, (-1, block)).unflatten(0, (-1, block))
-        planes = planes[:, :height, :width] * (blocks == middles[:, None, :, None]).view(height, width)
+        height, width = (length * block for length in middles.shape[1:])
+        blocks = labels[:, :height, :width].unflatten(2, (-1, block)).unflatten(1, (-1, block))
+        is_same = (blocks == middles[:, :, None, :, None]).view(-1, 1, height, width)
+        planes = planes[..., :height, :width] * is_same
     while block > 1:
         planes, block = halve(planes), block // 2
     return planes
 
 
 def _evaluate(planes: Tensor, labels: Tensor | None, sigma: float) -> tuple[Tensor, Tensor]:
-    """Return gain and colours of Gaussians at the pixels of planes, the last of which has the pixels' weights.
+    """Return gain (B, H, W) and colours of Gaussians at the pixels of planes, (B, C + 1, H, W).
 
-    Filters run along columns, then along rows, each time over the pixels of the same label alone. So a Gaussian sees
-    those of its region that it reaches by a column and a row.
+    The last plane has the pixels' weights. Filters run along columns, then along rows, each time over the pixels of the
+    same label alone. So a Gaussian sees those of its region that it reaches by a column and a row.
     """
     # the square of a Gaussian is one, too, narrower by sqrt 2
     arguments = planes, labels, sigma, sigma / math.sqrt(2.0), math.ceil(_REACH * sigma)
@@ -220,24 +289,24 @@ def _evaluate(planes: Tensor, labels: Tensor | None, sigma: float) -> tuple[Tens
     from .cuda import blur  # loads triton
 
     blurred = blur(*arguments)
-    colors = blurred[:-1] / blurred[-1]
-    return (blurred[:-1] * colors).sum(0), colors
+    colors = blurred[:, :-1] / blurred[:, -1:]
+    return (blurred[:, :-1] * colors).sum(1), colors
 
 
-def _pool(plane: Tensor, radius: int) -> Tensor:
-    """Return the largest value of each square of side 2 radius + 1."""
-    if not plane.is_cpu:
-        return max_pool2d(plane[None], 2 * radius + 1, 1, radius)[0]
+def _pool(planes: Tensor, radius: int) -> Tensor:
+    """Return the largest value of each square of side 2 radius + 1, of planes (B, H, W)."""
+    if not planes.is_cpu:
+        return max_pool2d(planes, 2 * radius + 1, 1, radius)
     # torch's pooling takes six times as long
-    plane = pad(plane, [radius] * 4)
-    for dim in (0, 1):
-        length = plane.shape[dim] - 2 * radius
-        plane = functools.reduce(torch.maximum, (plane.narrow(dim, start, length) for start in range(2 * radius + 1)))
-    return plane
+    planes = pad(planes, [radius] * 4)
+    for dim in (1, 2):
+        length = planes.shape[dim] - 2 * radius
+        planes = functools.reduce(torch.maximum, (planes.narrow(dim, start, length) for start in range(2 * radius + 1)))
+    return planes
 
 
-def _halve_by_maximum(plane: Tensor) -> Tensor:
+def _halve_by_maximum(planes: Tensor) -> Tensor:
     """Return the largest value, none negative, of each block of 2 x 2, of which the last may have less."""
-    plane = pad(plane, [0, plane.shape[1] % 2, 0, plane.shape[0] % 2])
-    rows = torch.maximum(plane[::2], plane[1::2])
-    return torch.maximum(rows[:, ::2], rows[:, 1::2])
+    planes = pad(planes, [0, planes.shape[2] % 2, 0, planes.shape[1] % 2])
+    rows = torch.maximum(planes[:, ::2], planes[:, 1::2])
+    return torch.maximum(rows[..., ::2], rows[..., 1::2])

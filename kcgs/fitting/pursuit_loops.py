@@ -21,96 +21,102 @@ _ROWS = 16
 
 
 def average(planes: Tensor, labels: Tensor, block: int) -> Tensor:
-    """Sum the pixels of each block that have the label of its middle, and divide by the number of all: (K, h, w).
+    """Sum the pixels of each block that have the label of its middle, and divide by the number of all: (B, K, h, w).
 
     Args:
-        planes: (K, H, W), contiguous, floating.
-        labels: (H, W), contiguous, of the same type.
+        planes: of each image, (B, K, H, W), contiguous, floating.
+        labels: (B, H, W), or (1, H, W) for all images, contiguous, of the same type.
         block: side of the blocks.
     """
-    count, height, width = planes.shape
-    averages = planes.new_empty(count, height // block, width // block)
+    batch, count, height, width = planes.shape
+    averages = planes.new_empty(batch, count, height // block, width // block)
     arguments = planes.numpy(), labels.numpy(), block, averages.numpy()
-    run_tasks(lambda tasks, counters: _average(*arguments, tasks, counters), ranges(height // block, _ROWS // block))
+    tasks = ranges(batch * (height // block), _ROWS // block)
+    run_tasks(lambda tasks, counters: _average(*arguments, tasks, counters), tasks)
     return averages
 
 
 @program.entry
 def _average(planes, labels, block, averages, tasks, counters):  # type: ignore[no-untyped-def]
-    """Fill ranges of rows."""
-    count, _, width = averages.shape
+    """Fill ranges of rows, which are numbered through all images."""
+    _, count, height, width = averages.shape
     one, share = labels.dtype.type(1.0), labels.dtype.type(1.0 / block**2)
     middles, is_same = np.empty(width * block, labels.dtype), np.empty(width * block, labels.dtype)
     sums = np.empty((count, width * block), labels.dtype)
     k = first_task(tasks, counters)
     while k >= 0:
-        for row in range(tasks[k, 1], tasks[k, 2]):
+        for number in range(tasks[k, 1], tasks[k, 2]):
+            b, row = divmod(number, height)
+            marks = labels[min(b, len(labels) - 1)]
             for x in range(width * block):
-                middles[x] = labels[row * block + block // 2, x // block * block + block // 2]
+                middles[x] = marks[row * block + block // 2, x // block * block + block // 2]
             sums.fill(0.0)
             for y in range(row * block, row * block + block):
-                _compare(middles, labels[y], is_same)
+                _compare(middles, marks[y], is_same)
                 for plane in range(count):
-                    _add(sums[plane], planes[plane, y], is_same, one)
+                    _add(sums[plane], planes[b, plane, y], is_same, one)
             for plane in range(count):
                 for column in range(width):
                     total = sums[plane, column * block]
                     for x in range(column * block + 1, column * block + block):
                         total += sums[plane, x]
-                    averages[plane, row, column] = share * total
+                    averages[b, plane, row, column] = share * total
         k = next_task(tasks, counters, k)
 
 
 def evaluate(
     planes: Tensor, labels: Tensor | None, sigma: float, norm_sigma: float, reach: int
 ) -> tuple[Tensor, Tensor]:
-    """Filter planes, (K, H, W), along columns, then along rows, each time over the pixels of the same label alone.
+    """Filter planes of images along columns, then along rows, each time over the pixels of the same label alone.
 
     Args:
-        planes: contiguous, floating, on any device.
-        labels: (H, W), contiguous, of the same type; None: all pixels are of one.
+        planes: (B, K, H, W), contiguous, floating, on any device.
+        labels: (B, H, W), or (1, H, W) for all images, contiguous, of the same type; None: all pixels are of one.
         sigma: standard deviation of the filter, in pixels.
         norm_sigma: that of the last plane's.
         reach: of both filters, in pixels.
 
     Returns:
-        The sum of the squares of the other planes, (H, W), and these planes, (K - 1, H, W), both divided by the last.
+        The sum of the squares of the other planes, (B, H, W), and these, (B, K - 1, H, W), both divided by the last.
     """
     values = planes.cpu().numpy()
-    marks = np.empty((0, 0), values.dtype) if labels is None else labels.cpu().numpy()
-    taps = np.array([gaussian_taps(sigma, reach)] * (len(values) - 1) + [gaussian_taps(norm_sigma, reach)])
-    gain, colors = np.zeros_like(values[0]), np.empty_like(values[1:])
+    marks = np.empty((0, 0, 0), values.dtype) if labels is None else labels.cpu().numpy()
+    batch, count, height, _ = values.shape
+    taps = np.array([gaussian_taps(sigma, reach)] * (count - 1) + [gaussian_taps(norm_sigma, reach)])
+    gain, colors = np.zeros_like(values[:, 0]), np.empty_like(values[:, 1:])
     arguments = values, marks, taps.astype(values.dtype), gain, colors
-    run_tasks(lambda tasks, counters: _evaluate(*arguments, tasks, counters), ranges(len(gain), _ROWS))
+    run_tasks(lambda tasks, counters: _evaluate(*arguments, tasks, counters), ranges(batch * height, _ROWS))
     return torch.from_numpy(gain).to(planes.device), torch.from_numpy(colors).to(planes.device)
 
 
 @program.entry
 def _evaluate(planes, labels, taps, gain, colors, tasks, counters):  # type: ignore[no-untyped-def]
-    """Fill ranges of rows; each plane has its taps."""
-    count, height, width = planes.shape
-    reach = taps.shape[1] - 1
+    """Fill ranges of rows, which are numbered through all images; each plane has its taps."""
+    _, count, height, width = planes.shape
+    reach, is_mapped = taps.shape[1] - 1, len(labels) > 0
     columns, rows = np.empty((count, width), planes.dtype), np.empty((count, width), planes.dtype)
     is_same = np.ones(width, planes.dtype)
     k = first_task(tasks, counters)
     while k >= 0:
-        for y in range(tasks[k, 1], tasks[k, 2]):
-            _copy(planes[:, y], columns)
+        for number in range(tasks[k, 1], tasks[k, 2]):
+            b, y = divmod(number, height)
+            image, mark = planes[b], min(b, len(labels) - 1)
+            _copy(image[:, y], columns)
             for other in range(max(y - reach, 0), min(y + reach + 1, height)):
                 if other != y:
-                    if len(labels) > 0:
-                        _compare(labels[y], labels[other], is_same)
+                    if is_mapped:
+                        _compare(labels[mark, y], labels[mark, other], is_same)
                     for plane in range(count):
-                        _add(columns[plane], planes[plane, other], is_same, taps[plane, abs(other - y)])
+                        _add(columns[plane], image[plane, other], is_same, taps[plane, abs(other - y)])
             _copy(columns, rows)
             for distance in range(1, min(reach + 1, width)):
-                if len(labels) > 0:
-                    _compare(labels[y, :-distance], labels[y, distance:], is_same)
+                if is_mapped:
+                    _compare(labels[mark, y, :-distance], labels[mark, y, distance:], is_same)
                 for plane in range(count):
                     _add(rows[plane, :-distance], columns[plane, distance:], is_same, taps[plane, distance])
                     _add(rows[plane, distance:], columns[plane, :-distance], is_same, taps[plane, distance])
             for plane in range(count - 1):
-                _divide(rows[plane], rows[count - 1], colors[plane, y], gain[y])
+                _divide(rows[plane], rows[count - 1], colors[b, plane, y], gain[b, y])
         k = next_task(tasks, counters, k)
 
 

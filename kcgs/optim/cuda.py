@@ -1,6 +1,7 @@
 """The steps of `gaussian_adam.py` in one launch of Triton: a thread moves a Gaussian, float32, on a CUDA device.
 
-Numbers in between are float64, as in `loops.py`. A Gaussian with a gradient that is not finite stays as it is.
+Numbers in between are float64, as in `loops.py`. A Gaussian that is frozen, by a negative age, or whose gradient is not
+finite, stays as it is.
 """
 
 from __future__ import annotations
@@ -118,6 +119,8 @@ def _step(  # type: ignore[no-untyped-def]
 
     if COLORS or OPACITIES:
         steps = tl.load(color_age + row, mask=mask, other=0.0) + 1.0
+        mask = mask & (steps > 0.0)
+        steps = tl.where(mask, steps, 1.0)
         tl.store(color_age + row, steps, mask=mask)
         rate, root = _rate(color_lr, color_beta1, color_beta2, steps.to(tl.float64), COLOR_LR_LOADED)
         for k in range(COLUMNS):
@@ -138,6 +141,8 @@ def _step(  # type: ignore[no-untyped-def]
         l21 = tl.load(cholesky + 3 * row + 1, mask=mask, other=0.0).to(tl.float64)
         l22 = tl.load(cholesky + 3 * row + 2, mask=mask, other=1.0).to(tl.float64)
         steps = tl.load(age + row, mask=mask, other=0.0) + 1.0
+        mask = mask & (steps > 0.0)
+        steps = tl.where(mask, steps, 1.0)
         tl.store(age + row, steps, mask=mask)
         rate, root = _rate(lr, beta1, beta2, steps.to(tl.float64), LR_LOADED)
         place = 5 * row

@@ -29,6 +29,8 @@ _TASK_ROWS = 512
 _THREAD_ROWS = 2048
 # pixels: factors are at least this before they are widened, so that their squares are far from underflow
 _MIN_FACTOR = 0.1
+# age of a row that does not move; loops and programs take every negative one as such
+_FROZEN = -1.0
 # standard deviations by which a centre may lie outside the image
 _MAX_OUTSIDE = 2.0
 
@@ -199,6 +201,36 @@ class GaussianAdam(Optimizer):
             rows = {name: _select_rows(average, index, average.ndim - 2) for name, average in state.items()}
             state.update(rows)
 
+    @torch.no_grad()
+    def freeze(self, field: GaussianField, mask: Tensor) -> None:
+        """Leave Gaussians as they are from here on, whatever their gradients.
+
+        Args:
+            field: one that the optimizer was made for.
+            mask: of these Gaussians, boolean, :math:`(N)` or :math:`(B, N)` as the field.
+
+        Raises:
+            ValueError: a field that the optimizer was not made for; a mask of another type or shape.
+
+        Example:
+            >>> field = GaussianField.random(4, (16, 24), seed=0)
+            >>> optimizer = GaussianAdam(field)
+            >>> optimizer.freeze(field, torch.tensor([True, False, False, False]))
+            >>> field.colors.grad, before = torch.ones(4, 3), field.colors.detach().clone()
+            >>> optimizer.step()
+            >>> (field.colors != before).any(-1)
+            tensor([False,  True,  True,  True])
+        """
+        geometry = self._group(field)
+        expected = field.means.shape[:-1]
+        if mask.dtype != torch.bool or mask.shape != expected:
+            raise InvalidArgument("mask", f"boolean, {tuple(expected)}", f"{mask.dtype}, {tuple(mask.shape)}")
+        colors = next(group for group in self.param_groups if group["params"][0] is field.colors)
+        for group in (geometry, colors):
+            state = self.state[group["params"][0]]
+            _begin(state, group)
+            state["age"].masked_fill_(mask[..., None], _FROZEN)
+
     def _group(self, field: GaussianField) -> dict[str, Any]:
         """Return the group of a field's geometry; ValueError for a field that the optimizer was not made for."""
         for group in self.param_groups:
@@ -248,9 +280,10 @@ def _step_colors(state: dict[str, Tensor], group: dict[str, Any], finite: Tensor
         loops.step_tables(tuple(_rows(*tables)), *_rows(gradient), Adam(*_settings(group), *_averages(state)))
         increment_version([parameter for parameter in group["params"] if parameter.requires_grad])
         return
-    change = _adam(state, gradient, group, finite)
+    moving = _moving_rows(state["age"], finite)
+    change = _adam(state, gradient, group, moving)
     for table, part in zip(tables, change.split([table.shape[-1] for table in tables], -1), strict=True):
-        _write(table, table + part, finite)
+        _write(table, table + part, moving)
 
 
 def _step_geometry(state: dict[str, Tensor], group: dict[str, Any], finite: Tensor | None) -> None:
@@ -268,12 +301,13 @@ def _step_geometry(state: dict[str, Tensor], group: dict[str, Any], finite: Tens
         run_tasks(loop, ranges(len(arrays[0]), _TASK_ROWS), 1 + len(arrays[0]) // _THREAD_ROWS)
         increment_version([parameter for parameter in group["params"] if parameter.requires_grad])
         return
-    step = _adam(state, local_gradient(cholesky, *gradients), group, finite)
+    moving = _moving_rows(state["age"], finite)
+    step = _adam(state, local_gradient(cholesky, *gradients), group, moving)
     step = step.clamp(-group["max_step"], group["max_step"])
     bounded = _bounded(*move(means, cholesky, step), group["size"], group["min_sigma"])
     for parameter, values in zip((means, cholesky), bounded, strict=True):
         if parameter.requires_grad:  # a frozen one is not even brought within bounds
-            _write(parameter, values, finite)
+            _write(parameter, values, moving)
 
 
 def _launch(state: dict[Tensor, Any], geometry: dict[str, Any], colors: dict[str, Any]) -> None:
@@ -363,19 +397,19 @@ def _begin(state: dict[str, Tensor], group: dict[str, Any]) -> None:
             state[name] = first.new_zeros(*first.shape[:-1], width)
 
 
-def _adam(state: dict[str, Tensor], gradient: Tensor, group: dict[str, Any], finite: Tensor | None) -> Tensor:
-    """Update the averages of a table (..., N, K), in rows of finite gradients, and return Adam's step."""
+def _adam(state: dict[str, Tensor], gradient: Tensor, group: dict[str, Any], moving: Tensor | None) -> Tensor:
+    """Update the averages of a table (..., N, K), in rows that move, and return Adam's step."""
     beta1, beta2 = group["betas"]
-    previous = [] if finite is None else [values.clone() for values in state.values()]
+    previous = [] if moving is None else [values.clone() for values in state.values()]
     age, average, square = state["age"], state["average"], state["square"]
     age += 1
     average.lerp_(gradient, 1 - beta1)
     square.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
     scale = (square / (1 - beta2**age)).sqrt_().add_(group["eps"])
     step: Tensor = average / (1 - beta1**age) / scale * -group["lr"]
-    if finite is not None:
+    if moving is not None:
         for values, old in zip(state.values(), previous, strict=True):
-            values.copy_(torch.where(finite, values, old))
+            values.copy_(torch.where(moving, values, old))
     return step
 
 
@@ -386,9 +420,16 @@ def _finite_rows(parameters: list[Tensor]) -> Tensor:
     return torch.cat(tables, -1).isfinite().all(-1, keepdim=True)
 
 
-def _write(table: Tensor, values: Tensor, finite: Tensor | None) -> None:
-    """Put values into a table, (..., N, K); with a mask, in rows of finite gradients, where the values are finite."""
-    table.copy_(values if finite is None else torch.where(finite & values.isfinite(), values, table))
+def _moving_rows(age: Tensor, finite: Tensor | None) -> Tensor | None:
+    """Return a mask of the Gaussians that move, (..., N, 1): of finite gradients, and not frozen; None: all do."""
+    if finite is not None:
+        return finite & (age >= 0)
+    return age >= 0 if bool((age < 0).any()) else None
+
+
+def _write(table: Tensor, values: Tensor, moving: Tensor | None) -> None:
+    """Put values into a table, (..., N, K); with a mask, in rows that move, where the values are finite."""
+    table.copy_(values if moving is None else torch.where(moving & values.isfinite(), values, table))
 
 
 def _bounded(means: Tensor, cholesky: Tensor, size: tuple[int, int], min_sigma: float) -> tuple[Tensor, Tensor]:

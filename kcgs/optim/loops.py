@@ -34,16 +34,22 @@ def _move(numbers, average, square, adam, age):  # type: ignore[no-untyped-def]
 
 @inner
 def _step(numbers, adam, begin):  # type: ignore[no-untyped-def]
-    """Put Adam's steps in the place of gradients [N, K], of rows from `begin` on; rows of one age go together."""
+    """Put Adam's steps in the place of gradients [N, K], of rows from `begin` on; rows of one age go together.
+
+    Rows of a negative age are frozen: their step is 0.
+    """
     first, columns = 0, numbers.shape[1]
     average, square, flat = adam.average.ravel(), adam.square.ravel(), numbers.ravel()
     while first < len(numbers):
         last, age = first, adam.age[begin + first, 0]
         while last < len(numbers) and adam.age[begin + last, 0] == age:
-            adam.age[begin + last, 0] += 1
+            adam.age[begin + last, 0] += 0 if age < 0 else 1
             last += 1
         part = slice((begin + first) * columns, (begin + last) * columns)
-        _move(flat[first * columns : last * columns], average[part], square[part], adam, np.float64(age + 1))
+        if age < 0:
+            flat[first * columns : last * columns] = 0.0
+        else:
+            _move(flat[first * columns : last * columns], average[part], square[part], adam, np.float64(age + 1))
         first = last
 
 

@@ -83,11 +83,12 @@ class TestGain:
         """Gains are those of each Gaussian in its region, exact but for blocks, and what a column and a row miss."""
         # error that varies no faster than the Gaussians, as that which they are chosen for
         residual = noise(channels, (40, 52), smooth=9).double()
-        labels = None if regions is None else regions.index[0].double()
-        scales = list(_scales(residual, labels))
+        index = None if regions is None else regions.index.double()
+        labels = None if index is None else index[0]
+        scales = list(_scales(residual[None], index))
         assert [scale.sigma for scale in scales] == [0.7, 1.1, 1.8, 2.9, 4.7, 7.5]
         for sigma, block, gain, _ in scales:
-            row, column = divmod(int(gain.argmax()), gain.shape[1])
+            row, column = divmod(int(gain.argmax()), gain.shape[2])
             x, y = (column + 0.5) * block, (row + 0.5) * block
             mask = torch.ones(40, 52) if labels is None else labels == labels[int(y), int(x)]
             expected = dense_gain(residual, mask, x, y, sigma)
@@ -100,23 +101,26 @@ class TestGain:
         self, size: tuple[int, int], has_labels: bool, dtype: torch.dtype
     ) -> None:
         generator = torch.Generator().manual_seed(0)
-        planes = torch.rand(4, *size, generator=generator).to(dtype)
-        labels = torch.randint(0, 2, size, generator=generator).to(dtype)
-        expected = dense_filter(planes.double(), labels if has_labels else torch.zeros_like(labels), 1.3)
-        for actual, values in zip(_evaluate(planes, labels if has_labels else None, 1.3), expected, strict=True):
-            torch.testing.assert_close(actual, values.to(dtype))
+        planes = torch.rand(2, 4, *size, generator=generator).to(dtype)
+        labels = torch.randint(0, 2, (2, *size), generator=generator).to(dtype)
+        actual = _evaluate(planes, labels if has_labels else None, 1.3)
+        for k in range(2):
+            expected = dense_filter(planes[k].double(), labels[k] if has_labels else torch.zeros(size), 1.3)
+            torch.testing.assert_close([values[k] for values in actual], [values.to(dtype) for values in expected])
 
     @pytest.mark.parametrize("size", [(21, 70), (8, 9)])
     @pytest.mark.parametrize("block", [2, 4, 8])
     def test_blocks_are_averaged_over_the_label_of_their_middle(self, size: tuple[int, int], block: int) -> None:
         generator = torch.Generator().manual_seed(0)
-        planes, labels = torch.rand(3, *size, generator=generator), torch.randint(0, 2, size, generator=generator)
+        planes = torch.rand(2, 3, *size, generator=generator)
+        labels = torch.randint(0, 2, (2, *size), generator=generator)
         averages = _average(planes, labels.float(), block)
-        assert averages.shape == (3, size[0] // block, size[1] // block)
-        for row, column in np.ndindex(*averages.shape[1:]):
+        assert averages.shape == (2, 3, size[0] // block, size[1] // block)
+        for image, row, column in np.ndindex(2, *averages.shape[2:]):
             rows, columns = (slice(block * k, block * k + block) for k in (row, column))
-            is_same = labels[rows, columns] == labels[rows, columns][block // 2, block // 2]
-            torch.testing.assert_close(averages[:, row, column], (planes[:, rows, columns] * is_same).mean((1, 2)))
+            marks, values = labels[image, rows, columns], planes[image, :, rows, columns]
+            is_same = marks == marks[block // 2, block // 2]
+            torch.testing.assert_close(averages[image, :, row, column], (values * is_same).mean((1, 2)))
 
     def test_finds_the_gaussian_that_is_there(self) -> None:
         mean, cholesky = torch.tensor([[20.5, 14.5]]), torch.tensor([[1.8, 0.0, 1.8]])
@@ -283,7 +287,8 @@ class TestTriton:
 
         monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
         constants = {"MAPPED": has_labels, "PIXELS": cuda._PIXELS}
-        types = {**dict.fromkeys(constants, "constexpr"), **dict.fromkeys(("area", "stride", "length", "reach"), "i32")}
+        integers = ("area", "stride", "length", "labels_per_image", "reach")
+        types = {**dict.fromkeys(constants, "constexpr"), **dict.fromkeys(integers, "i32")}
         types |= dict.fromkeys(("exponent", "norm_exponent"), "fp32")
         signature = {name: types.get(name, "*fp32") for name in cuda._blur.jit.arg_names}
         source = triton.compiler.ASTSource(cuda._blur.jit, signature, constants)

@@ -11,11 +11,11 @@ DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
 @pytest.mark.parametrize("size", [(13, 57), (1, 3), (40, 2)])
-@pytest.mark.parametrize("has_labels", [False, True])
-def test_filters_as_compiled_loops(size: tuple[int, int], has_labels: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("num_maps", [0, 1, 3])
+def test_filters_as_compiled_loops(size: tuple[int, int], num_maps: int, monkeypatch: pytest.MonkeyPatch) -> None:
     generator = torch.Generator().manual_seed(0)
-    planes = torch.rand(4, *size, generator=generator).to(DEVICE)
-    labels = torch.randint(0, 2, size, generator=generator).to(planes) if has_labels else None
+    planes = torch.rand(3, 4, *size, generator=generator).to(DEVICE)
+    labels = torch.randint(0, 2, (num_maps, *size), generator=generator).to(planes) if num_maps else None
     pair = []
     for is_taken in (False, True):
         monkeypatch.setattr(pursuit, "takes_triton", lambda *tensors: is_taken)  # noqa: B023

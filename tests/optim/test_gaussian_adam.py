@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from kcgs import GaussianField, RegionSplatRenderer, Scene
 from kcgs.optim import GaussianAdam
@@ -292,6 +293,12 @@ def test_keep_takes_a_mask_for_each_image() -> None:
         optimizer.keep(batch, torch.ones(2, 13) > 0)
 
 
+def test_freeze_takes_a_mask_of_rows() -> None:
+    field = field_of()
+    with pytest.raises(ValueError, match=r"mask must be boolean, \(20,\); got torch.bool, \(19,\)"):
+        GaussianAdam(field).freeze(field, torch.ones(19, dtype=torch.bool))
+
+
 @pytest.mark.parametrize("kind", KINDS)
 class TestRows:
     def test_keep_leaves_the_averages_of_the_others(self, kind: str) -> None:
@@ -326,3 +333,33 @@ class TestRows:
         losses = descend(field, optimizer, 30, regions_of(kind))
         assert losses[-1] < losses[0]
         assert all(parameter in {*field.parameters()} for g in optimizer.param_groups for parameter in g["params"])
+
+    def test_frozen_rows_stay_and_the_others_do_not_notice(self, kind: str) -> None:
+        """Also where rows are added and removed, whatever the gradients."""
+        field, twin = field_of(kind), field_of(kind)
+        optimizer, other = GaussianAdam(field), GaussianAdam(twin)
+        mask = torch.zeros(field.means.shape[:-1], dtype=torch.bool)
+        mask[..., [0, 7, 19]] = True
+        before = tensors(field)
+        for step in range(4):
+            if step == 1:
+                optimizer.freeze(field, mask)
+                before = [tensor.clone() for tensor in tensors(field)]
+            if step == 2:
+                for each, its_field in ((optimizer, field), (other, twin)):
+                    each.append(its_field, field_of(kind, 5))
+            for each, its_field in ((optimizer, field), (other, twin)):
+                for k, parameter in enumerate(its_field.parameters()):
+                    generator = torch.Generator().manual_seed(10 * step + k)
+                    parameter.grad = torch.randn(parameter.shape, generator=generator).to(parameter)
+                each.step()
+        rows = pad(mask, (0, 5))
+        for value, expected, first in zip(tensors(field), tensors(twin), before, strict=True):
+            assert torch.equal(value[~rows], expected[~rows])
+            assert torch.equal(value[rows], first[mask]) and not torch.equal(value[rows], expected[rows])
+        optimizer.keep(field, torch.arange(25) != 7)
+        field.colors.grad = torch.ones_like(field.colors)
+        kept = field.colors.detach().clone()
+        optimizer.step()
+        stays = (field.colors == kept).all(-1).reshape(-1, 24)
+        assert stays[:, [0, 18]].all() and not stays[:, [1, 7, 19]].any()

@@ -69,8 +69,13 @@ def test_takes_the_steps_of_torch_operations(kind: str, launches: list[int]) -> 
         if step == 3:
             for each, optimizer in zip((field, twin), optimizers, strict=True):
                 optimizer.append(each, copy.deepcopy(each))
+        if step == 4:
+            for each, optimizer in zip((field, twin), optimizers, strict=True):
+                optimizer.freeze(
+                    each, (torch.arange(each.num_gaussians, device=DEVICE) == 5).expand(each.means.shape[:-1])
+                )
         give_gradients(generator, field, twin)
-        rows = [0, 7, 19]
+        rows = [0, 7, 19] + [5] * (step >= 4)
         for each in (field, twin):
             assert each.means.grad is not None and each.colors.grad is not None
             each.means.grad[..., rows[0], 1] = math.nan
