@@ -20,13 +20,16 @@ from kcgs.errors import InvalidArgument, InvalidArgumentType
 LUMA = (0.299, 0.587, 0.114)
 
 
-def as_image(name: str, value: object, tolerance: float = 0.0, keep_alpha: bool = False) -> Tensor:
+def as_image(
+    name: str, value: object, tolerance: float = 0.0, keep_alpha: bool = False, keep_batch: bool = False
+) -> Tensor:
     """Return an image as a tensor (C, H, W) in [0, 1], which its values may pass by `tolerance`.
 
     An image is a Tensor (C, H, W) or (1, C, H, W), whose channels are taken as they are; a numpy array (H, W, C) or
     (H, W) of uint8, uint16 or floats in [0, 1]; a PIL image; or a path, as `kcgs.data.load_image` reads it. Arrays of
     four channels and PIL images with alpha are composed on white, with a warning where a pixel is transparent, unless
     `keep_alpha`. A Tensor that looks like (H, W, C) is refused: more than 4 channels and rows, and 1, 3 or 4 columns.
+    With `keep_batch` a Tensor may be a batch (B, C, H, W), and stays one.
     """
     has_alpha = False
     if isinstance(value, np.ndarray):
@@ -46,15 +49,17 @@ def as_image(name: str, value: object, tolerance: float = 0.0, keep_alpha: bool 
     else:
         expected = "a Tensor, a numpy array, a PIL image or a path"
         raise InvalidArgumentType(name, expected, type(value).__name__)
-    if image.ndim == 4:
+    if image.ndim == 4 and not keep_batch:
         if image.shape[0] != 1:
             raise InvalidArgument(name, "one image, (C, H, W) or (1, C, H, W)", tuple(image.shape))
         image = image[0]
     low, high = (float(end) for end in image.detach().aminmax()) if image.numel() else (math.nan, math.nan)
     if not (math.isfinite(low) and math.isfinite(high)):
         check_image(name, image.detach().cpu())  # raises: not finite, or empty
-    if image.shape[-1] in (1, 3, 4) and min(image.shape[:2]) > 4:
+    if image.shape[-1] in (1, 3, 4) and min(image.shape[-3:-1]) > 4:
         advice = f"pass {name}.permute(2, 0, 1), or a numpy array (H, W, C)"
+        if image.ndim == 4:
+            advice = f"pass {name}.permute(0, 3, 1, 2)"
         raise InvalidArgument(name, "(C, H, W)", f"{tuple(image.shape)}, which looks like (H, W, C): {advice}")
     if low < -tolerance or high > 1 + tolerance:
         raise InvalidArgument(name, "in [0, 1]", f"[{low:g}, {high:g}]{_scale_hint(image)}")

@@ -1,4 +1,4 @@
-"""An error before the work begins, where an image does not fit into memory."""
+"""An error before the work begins, where images do not fit into memory."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ import os
 import re
 from contextlib import suppress
 from pathlib import Path
+
+import torch
+from torch import Tensor
 
 # bytes that every machine is taken to have: the free memory is looked up for more only
 _SMALL = 1 << 26
@@ -18,6 +21,17 @@ def check_memory(name: str, size: tuple[int, int], per_pixel: float) -> None:
     if needed > _SMALL and needed > (free := free_memory()):
         memory = f"about {needed / 1e9:,.1f} GB of memory; {free / 1e9:,.1f} GB are free"
         raise ValueError(f"{name} asks for {size[1]} x {size[0]} pixels, which need {memory}")
+
+
+def check_batch_memory(name: str, images: Tensor, per_image: float) -> None:
+    """Raise ValueError if images of so many bytes each need more memory than is free; it says how many fit."""
+    count, needed = len(images), len(images) * per_image
+    if needed <= _SMALL:
+        return
+    free = float(torch.cuda.mem_get_info(images.device)[0]) if images.is_cuda else free_memory()
+    if needed > free:
+        memory = f"{needed / 1e9:,.1f} GB of memory; {free / 1e9:,.1f} GB are free"
+        raise ValueError(f"{name} has {count} images, which need about {memory}: at most {int(free / per_image)} fit")
 
 
 def free_memory() -> float:

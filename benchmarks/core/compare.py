@@ -45,6 +45,8 @@ COLUMNS = {
     "decoded_ef_psnr": Column("EF-PSNR decoded", ".2f", 0.005),
     "core_seconds": Column("seconds of a core", ".1f", 0.05, less_is_better=True),
     "seconds": Column("seconds", "", less_is_better=True),
+    "batch": Column("images in a batch", ",.0f"),
+    "images_per_second": Column("images per second", ""),
     "forward_ms": Column("forward, ms", "", less_is_better=True),
     "both_ms": Column("forward and backward, ms", "", less_is_better=True),
     "captured_forward_ms": Column("forward captured, ms", "", less_is_better=True),

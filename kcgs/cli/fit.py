@@ -65,6 +65,7 @@ def fit_command(
     with InterruptHandler() as interrupts:
         saved_fit = fit_and_save(output, target, labels, request, on_step=interrupts.on_step, progress=not quiet)
     report, regions_report = report_fit(saved_fit, target, labels, output, request), saved_fit.result.regions
+    assert not isinstance(regions_report, list)  # the image is no batch
     if interrupts.count:
         report["stop_reason"] = "interrupted"
     if as_json:

@@ -17,6 +17,7 @@ from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
+from .best import Best
 from .problem import Problem
 from .result import HistoryEntry
 from .start import make_state
@@ -24,7 +25,7 @@ from .state import FitState
 
 # a checkpoint is written when the fit has run this many times as long as the last one took to write
 _RUN_PER_WRITE = 100.0
-_VERSION = 10
+_VERSION = 11
 _DIGEST_SIZE = 32  # bytes of the SHA-256 of the content, which begins the file
 
 
@@ -86,7 +87,7 @@ def _to_plain(state: FitState) -> dict[str, Any]:
         "numbers": _numbers(state),
         "cutoff": state.renderer.cutoff,
         "scene": _scene_to_plain(state.scene),
-        "best": None if state.best is None else _scene_to_plain(state.best),
+        "best": None if state.best is None else _best_to_plain(state.best),
         "anchor": None if state.anchor is None else state.anchor.state(),
         "optimizer": state.optimizer.state_dict(),
         "history": [tuple(entry) for entry in state.history],
@@ -105,7 +106,7 @@ def _from_plain(plain: dict[str, Any], problem: Problem) -> FitState:
         problem, scene.field, scene.regions,
         anchor=None if plain["anchor"] is None else RegionMap.from_state(plain["anchor"]),
         history=[HistoryEntry(*entry) for entry in plain["history"]],
-        best=None if plain["best"] is None else _scene_from_plain(plain["best"], problem.size),
+        best=None if plain["best"] is None else _best_from_plain(plain["best"], problem.size),
         **plain["numbers"],
     )  # fmt: skip
     state.renderer = state.renderer._replace(cutoff=plain["cutoff"])
@@ -122,3 +123,12 @@ def _scene_to_plain(scene: Scene) -> dict[str, Any]:
 def _scene_from_plain(plain: dict[str, Any], size: tuple[int, int]) -> Scene:
     regions = None if plain["regions"] is None else RegionMap.from_state(plain["regions"])
     return Scene(GaussianField(*plain["tensors"], size=size), regions)
+
+
+def _best_to_plain(best: Best) -> dict[str, Any]:
+    return {"scene": _scene_to_plain(best.scene), "numbers": [best.is_draft, best.value, best.psnr]}
+
+
+def _best_from_plain(plain: dict[str, Any], size: tuple[int, int]) -> Best:
+    scene = _scene_from_plain(plain["scene"], size)
+    return Best(scene.field, [scene.regions], *(numbers.cpu() for numbers in plain["numbers"]))

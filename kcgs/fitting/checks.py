@@ -20,8 +20,30 @@ def check_image_and_regions(image: Any, regions: object) -> tuple[Tensor, Region
     regions = regions_of(image.shape[1:], regions)
     if regions is not None:
         regions = regions.to(image.device)
+    return _copy_of(image), regions
+
+
+def check_images_and_regions(images: Any, regions: object, keep_batch: bool = True) -> tuple[Tensor, RegionMap | None]:
+    """Do the same for one image, or a batch; the images are (B, C, H, W), and more than one have a map each."""
+    if not (keep_batch and is_batch(images)):
+        image, region_map = check_image_and_regions(images, regions)
+        return image[None], region_map
+    images = as_image("image", images, keep_batch=True)
+    region_map = regions_of(images.shape[2:], regions, len(images))
+    if region_map is not None and region_map.num_maps is None and len(images) > 1:
+        region_map = RegionMap.stack([region_map] * len(images))
+    return _copy_of(images), None if region_map is None else region_map.to(images.device)
+
+
+def is_batch(images: object) -> bool:
+    """Whether images are a batch, (B, C, H, W)."""
+    return isinstance(images, Tensor) and images.ndim == 4
+
+
+def _copy_of(image: Tensor) -> Tensor:
+    """Copy an image, as float32 or float64."""
     dtype = torch.float64 if image.dtype == torch.float64 else torch.float32
-    return image.detach().to(dtype, copy=True, memory_format=torch.contiguous_format), regions
+    return image.detach().to(dtype, copy=True, memory_format=torch.contiguous_format)
 
 
 def regions_of(size: tuple[int, ...], regions: object, num_images: int | None = None) -> RegionMap | None:
@@ -38,15 +60,11 @@ def regions_of(size: tuple[int, ...], regions: object, num_images: int | None = 
     return regions
 
 
-def map_of_each(regions: RegionMap | None, count: int) -> list[RegionMap | None]:
-    """Return the map of each of so many images: of a batch with their own regions, else the one that all have."""
-    return [regions if regions is None or regions.num_maps is None else regions[k] for k in range(count)]
-
-
 def check_num_gaussians(value: object, image: Tensor) -> int:
-    """Return N if it is a number of Gaussians that an image (C, H, W) can use."""
-    count, pixels = check_count("num_gaussians", value), image.shape[1] * image.shape[2]
+    """Return N if it is a number of Gaussians that an image (..., C, H, W) can use."""
+    count, (height, width) = check_count("num_gaussians", value), image.shape[-2:]
+    pixels = height * width
     if count > pixels:
-        size = f"{image.shape[2]} x {image.shape[1]}"
+        size = f"{width} x {height}"
         raise InvalidArgument("num_gaussians", f"at most {pixels}, the pixels of the {size} image", count)
     return count

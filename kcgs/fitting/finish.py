@@ -2,41 +2,64 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 
 from kcgs.optim import Gaussians
-from kcgs.pruning import prune
+from kcgs.pruning import PruneResult, prune
+from kcgs.scene import Scene
 
+from .batch_maps import map_of_each
 from .clock import Clock
 from .measurement import measure_errors, snapshot
-from .region_report import report_regions
+from .problem import Problem
+from .region_report import RegionReport, report_regions
 from .removal import remove_gaussians
 from .result import FitResult
-from .state import Errors, FitState, Measurement, record
+from .state import FitState, Measurement, record
 
 
 def finish(state: FitState, reason: str, clock: Clock) -> FitResult:
     """Measure the last scene, take the best, and prune it; return a fit that ended for a reason."""
-    problem, config, best_draft, seconds = state.problem, state.problem.config, state.best, clock.seconds()
-    with torch.no_grad():
-        if state.is_draft:
-            state.end_drafts()
-            if best_draft is not None:
-                renderer = state.renderer._replace(regions=best_draft.regions)
-                errors = measure_errors(problem, renderer.render(Gaussians.of(best_draft.field)))
-                # the draft was measured before, with another cutoff
-                measurement = Measurement(state.iteration, seconds, best_draft, is_draft=False)
-                record(state, measurement, Errors(*errors.tolist()))
-        if reason != "diverged" and state.is_finite:
-            remove_gaussians(state, state.num_gaussians - problem.num_gaussians)
-            errors = measure_errors(problem, state.render())
-            record(state, snapshot(state, seconds), Errors(*errors.tolist()))
+    _measure_last(state, clock.seconds())
     assert state.best is not None
-    scene, num_pruned, prune_error = state.best, 0, 0.0
+    problem, config = state.problem, state.problem.config
+    scene, psnr = state.best.scene, state.best.psnr
+    pruned = PruneResult(scene, torch.zeros_like(psnr, dtype=torch.int64), torch.zeros_like(psnr))
+    if not problem.is_batch:
+        pruned = PruneResult(scene[0], 0, 0.0)
     if config.prune > 0:
-        pruned = prune(scene, config.prune, cutoff=config.cutoff, backend=config.backend)
-        scene, num_pruned, prune_error = pruned.scene, int(pruned.num_pruned), float(pruned.prune_error)
-    report = report_regions(problem.regions, scene, dropped=None if config.guidance else "recipe")
+        pruned = prune(pruned.scene, config.prune, cutoff=config.cutoff, backend=config.backend)
     return FitResult(
-        scene, state.history, reason, config, num_pruned, prune_error, report, clock.seconds(), state.best_psnr
-    )
+        pruned.scene, state.history, reason, config, pruned.num_pruned, pruned.prune_error,
+        _report_regions(problem, pruned.scene), clock.seconds(), psnr if problem.is_batch else float(psnr),
+    )  # fmt: skip
+
+
+def _report_regions(problem: Problem, scene: Scene) -> RegionReport | list[RegionReport] | None:
+    """Say what became of the map, or of the map of each image of a batch."""
+    dropped: Literal["recipe"] | None = None if problem.config.guidance else "recipe"
+    if problem.regions is None:
+        return None
+    if not problem.is_batch:
+        return report_regions(problem.regions, scene, dropped=dropped)
+    maps = map_of_each(problem.regions, problem.num_images)
+    return [report_regions(one, part, dropped=dropped) for one, part in zip(maps, scene, strict=True)]
+
+
+@torch.no_grad()
+def _measure_last(state: FitState, seconds: float) -> None:
+    """Measure the best with the cutoff of the result, and the last scene of images that did not diverge."""
+    problem, drafts = state.problem, state.best
+    if state.is_draft:
+        state.end_drafts()
+        if drafts is not None:
+            scene = drafts.scene
+            renderer = state.renderer._replace(regions=scene.regions)
+            errors = measure_errors(problem, renderer.render(Gaussians.of(scene.field)))
+            record(state, Measurement(state.iteration, seconds, scene, is_draft=False, excluded=[]), errors)
+    state.exclude(state.diverging())
+    if not state.has_diverged:
+        remove_gaussians(state, state.num_gaussians - problem.num_gaussians)
+        record(state, snapshot(state, seconds), measure_errors(problem, state.render()))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import Any
 
@@ -12,7 +13,8 @@ from kcgs._check import check_count
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 
-from .checks import check_image_and_regions, check_num_gaussians, map_of_each, regions_of
+from .batch_maps import map_of_each
+from .checks import check_images_and_regions, check_num_gaussians, is_batch
 
 # sum of the weights of Gaussians of half the spacing at a pixel
 OVERLAP = math.pi / 2
@@ -49,20 +51,18 @@ def initial_field(
         >>> initial_field(torch.rand(4, 3, 32, 48), 60).means.shape
         torch.Size([4, 60, 2])
     """
-    if isinstance(image, Tensor) and image.ndim == 4 and len(image):
-        maps = map_of_each(regions_of(image.shape[-2:], regions, len(image)), len(image))
-        pairs = zip(image, maps, strict=True)
-        return GaussianField.stack([initial_field(one, num_gaussians, of_one, seed) for one, of_one in pairs])
-    image, regions = check_image_and_regions(image, regions)
-    count = check_num_gaussians(num_gaussians, image)
-    return uniform_field(image, count, regions, check_count("seed", seed, 0, 2**63 - 1))
+    images, regions = check_images_and_regions(image, regions)
+    count = check_num_gaussians(num_gaussians, images)
+    field = uniform_field(images, count, regions, check_count("seed", seed, 0, 2**63 - 1))
+    return field if is_batch(image) else field[0]
 
 
-def uniform_field(image: Tensor, num_gaussians: int, regions: RegionMap | None, seed: int) -> GaussianField:
-    """Scatter round Gaussians uniformly over the image, in its colours: `initial_field` without its checks."""
-    field = random_field(image, num_gaussians, regions, seed)
+def uniform_field(images: Tensor, num_gaussians: int, regions: RegionMap | None, seed: int) -> GaussianField:
+    """Scatter round Gaussians uniformly over images, (B, C, H, W), in their colours: see `initial_field`."""
+    field = random_field(images, num_gaussians, regions, seed)
     x, y = field.means.detach().long().unbind(-1)
-    field.colors.data = (image[:, y, x].T / OVERLAP).contiguous()
+    pixels = (y * images.shape[3] + x)[:, None].expand(-1, images.shape[1], -1)
+    field.colors.data = (images.flatten(2).gather(2, pixels).mT / OVERLAP).contiguous()
     return field
 
 
@@ -71,18 +71,27 @@ def initial_sigma(size: tuple[int, int], num_gaussians: int) -> float:
     return max(1.0, 0.5 * math.sqrt(size[0] * size[1] / num_gaussians))
 
 
-def random_field(image: Tensor, num_gaussians: int, regions: RegionMap | None, seed: int) -> GaussianField:
-    """Scatter round Gaussians uniformly over the image, in random colours."""
-    size = (image.shape[1], image.shape[2])
-    sigma = initial_sigma(size, num_gaussians)
-    field = GaussianField.random(num_gaussians, size, channels=len(image), sigma=sigma, seed=seed, dtype=image.dtype)
-    if regions is not None:
-        regions = regions.to("cpu")  # a device would be waited for in each empty region
-        field.assign_regions(regions)
-        with torch.no_grad():
-            _fill_empty_regions(field, regions, seed)
-        field.assign_regions(regions)
-    return field.to(image.device)
+def random_field(images: Tensor, num_gaussians: int, regions: RegionMap | None, seed: int) -> GaussianField:
+    """Scatter round Gaussians uniformly over images, (B, C, H, W), in random colours, the same in all of them."""
+    batch, channels, *size = images.shape
+    sigma = initial_sigma((size[0], size[1]), num_gaussians)
+    field = GaussianField.random(
+        num_gaussians, (size[0], size[1]), channels=channels, sigma=sigma, seed=seed, dtype=images.dtype
+    )
+    if regions is None:
+        tables = (table.detach().expand(batch, -1, -1) for table in (field.means, field.cholesky, field.colors))
+        return GaussianField(*tables, size=field.size).to(images.device)
+    maps = map_of_each(regions.to("cpu"), batch)  # a device would be waited for in each empty region
+    fields = [_assign_regions(copy.deepcopy(field), one, seed) for one in maps]
+    return GaussianField.stack(fields).to(images.device)
+
+
+@torch.no_grad()
+def _assign_regions(field: GaussianField, regions: RegionMap, seed: int) -> GaussianField:
+    """Give Gaussians the regions under their centres, and move some into regions that would have none."""
+    field.assign_regions(regions)
+    _fill_empty_regions(field, regions, seed)
+    return field.assign_regions(regions)
 
 
 def _fill_empty_regions(field: GaussianField, regions: RegionMap, seed: int) -> None:

@@ -18,10 +18,11 @@ from kcgs.kernels import warm_up
 from kcgs.nn import GaussianField
 from kcgs.optim import End, Event, Loss, run
 
+from .batch_maps import regions_per_map
 from .checkpoint import Checkpoint
 from .clock import Clock
 from .config import FitConfig
-from .events import Log, OnStep, Report, StopAtDivergence
+from .events import HandleDivergence, Log, OnStep, Report
 from .finish import finish
 from .optimizers import optimizer_kind
 from .problem import Problem, make_problem
@@ -54,7 +55,7 @@ def fit(
     channels: int = 3,
     **settings: Any,
 ) -> FitResult:
-    r"""Fit Gaussians to an image.
+    r"""Fit Gaussians to an image, or to all images of a batch at once.
 
     Convention: on one device, the same arguments and number of threads give the same scene, bit for bit (unless the
     clock stops it). On a GPU the history comes up to 20 iterations late. The best state that was logged is returned,
@@ -62,20 +63,25 @@ def fit(
     scene holds fewer than N Gaussians where the recipe prunes, or its target takes fewer. With `target_psnr` several
     fits search for the fewest Gaussians that reach it; `on_step` counts the iterations of each.
 
+    A batch has as many rows for each image; one that an image has no use for has the colour 0. On a CPU and without a
+    map, an image gets the scene that it gets alone with the same seed, bit for bit. With maps a batch starts with as
+    many Gaussians as the map of most regions has, so that scenes differ a little. An image whose numbers overflow keeps
+    its best scene, with a UserWarning, and the others go on. The history has means over the images.
+
     The history's `loss` is the value of the objective. With a loss of your own, such as one of Kornia's, the scene of
     the lowest is returned. Gaussians are added where the render differs from the image, and contours move to it;
     without an image they are added where the loss has its slope, contours stay, and PSNR is NaN.
 
     Args:
-        image: Tensor :math:`(C, H, W)` or :math:`(1, C, H, W)`, floating, values in [0, 1]; a numpy array
+        image: Tensor :math:`(C, H, W)`, or a batch :math:`(B, C, H, W)`, floating, values in [0, 1]; a numpy array
             :math:`(H, W, C)`, uint8 or floating; a PIL image; or a path, as :func:`kcgs.data.load_image` reads it.
             None with a loss of your own that does not need it.
         regions: label map of the image's size: a Tensor or a numpy array, integer or bool, a PIL image, or a path, as
             :func:`kcgs.data.load_labels` reads it; or a RegionMap. EF-PSNR is measured along its contours. None: one
-            region.
-        num_gaussians: N, the most there may be, from 1 to the number of pixels. Where it is below the number of
-            regions, those most alike are merged until each has a Gaussian, or with ``merge_regions=False`` the smaller
-            ones stay empty and black; a UserWarning gives their number.
+            region. For a batch one for all images, or one for each.
+        num_gaussians: N, the most there may be for each image, from 1 to the number of pixels. Where it is below the
+            number of regions, those most alike are merged until each has a Gaussian, or with ``merge_regions=False``
+            the smaller ones stay empty and black; a UserWarning gives their number.
         recipe: a name from :func:`available_recipes`, or settings.
         objective: what is lowered, by a name of :class:`FitConfig`; or a loss of your own, a function from a render,
             :math:`(1, C, H, W)`, not clipped, to a scalar, through which autograd goes. None: the recipe's, else l2.
@@ -96,14 +102,16 @@ def fit(
 
     Returns:
         The scene (its contours moved, its regions merged, where the recipe does so), history, why it stopped, settings,
-        how many Gaussians were pruned, and what became of the regions.
+        how many Gaussians were pruned, and what became of the regions. For :math:`(B, C, H, W)` the scene is a batch,
+        also of one image, and PSNR and number of pruned Gaussians are :math:`(B)`.
 
     Raises:
         TypeError: wrong types.
         ValueError: an image that is not finite or not in [0, 1], regions of another size, N below 1 or
             above the number of pixels, unknown recipe or setting, a checkpoint that is damaged or of another fit, or
             one of a fit with functions of your own, which no file keeps; no image and no size; a loss that is no scalar
-            or does not depend on the render.
+            or does not depend on the render; several images with `target_psnr`, a checkpoint or a loss of your own, or
+            more than fit into memory.
         OSError: a checkpoint that cannot be written; raised before the fit.
 
     Example:
@@ -112,6 +120,9 @@ def fit(
         >>> result = fit(image, (image[0] > 0.5).long(), num_gaussians=4, recipe="paper", iterations=200)
         >>> result.history[-1].psnr > 20, result.scene.regions.num_regions
         (True, 2)
+        >>> batch = fit(torch.rand(4, 3, 16, 24), num_gaussians=8, iterations=50)
+        >>> len(batch.scene), batch.scene.render().shape, batch.psnr.shape
+        (4, torch.Size([4, 3, 16, 24]), torch.Size([4]))
     """
     named, objects = split_names(objective=objective, densify=densify, optimizer=optimizer)
     config = FitConfig.from_recipe(recipe, **named, **settings)
@@ -121,6 +132,10 @@ def fit(
     own = [name for name, value in objects._asdict().items() if value is not None]
     if own and checkpoint is not None:
         raise InvalidArgument("checkpoint", f"None with {own[0]} of your own, which no file keeps", repr(checkpoint))
+    if problem.num_images > 1 and checkpoint is not None:
+        raise InvalidArgument(
+            "checkpoint", f"None with {problem.num_images} images: fit them one by one", repr(checkpoint)
+        )
     if config.target_psnr is not None and checkpoint is not None:
         raise InvalidArgument("checkpoint", "None with target_psnr, which takes several fits", repr(checkpoint))
     return fit_problem(problem, on_step, progress, checkpoint, resume)
@@ -150,10 +165,10 @@ def fit_problem(
     canvas = problem.canvas
     if problem.config.max_seconds is not None:
         precompile(problem.config, canvas.device)
-    warm_up(problem.config.backend, canvas.device, canvas.dtype, len(canvas))
+    warm_up(problem.config.backend, canvas.device, canvas.dtype, canvas.shape[1])
     _warn_of_regions(problem)
     searches = problem.config.target_psnr is not None
-    with Progress("fit", pulse=searches, visible=progress) as bar, threads_for_kernels(canvas[0].numel()):
+    with Progress("fit", pulse=searches, visible=progress) as bar, threads_for_kernels(canvas[0, 0].numel()):
         run_from = partial(_run, stepper_of=stepper_of, bar=bar, on_step=on_step)
         if searches:
             return search(problem, lambda state: run_from(state, Clock()))
@@ -185,7 +200,7 @@ def _run(
     end = End(until, lambda: "seconds" if clock.seconds() >= max_seconds else "iterations")
     report = Report(stepper, clock, bar, on_step, store)
     schedule, log = make_schedule(state.problem), Log(stepper, clock)
-    events: list[Event] = [report, end, StopAtDivergence(stepper), *schedule, log]
+    events: list[Event] = [report, end, HandleDivergence(stepper), *schedule, log]
     reason = run(state, stepper.step, progress, events, optimizer_kind(state.problem).rate)
     stepper.poll(wait=True)
     return finish(state, reason, clock)
@@ -196,5 +211,6 @@ def _warn_of_regions(problem: Problem) -> None:
     if problem.num_excess_regions == 0 or problem.regions is None:
         return
     effect = "were merged with others" if problem.config.merge_regions else "get no Gaussian and stay black"
-    regions = f"{problem.num_excess_regions} of {problem.regions.num_regions} regions {effect}"
+    total = sum(regions_per_map(problem.regions))
+    regions = f"{problem.num_excess_regions} of {total} regions {effect}"
     warn_user(f"{regions}: there are more than num_gaussians, {problem.num_gaussians}")

@@ -1,4 +1,4 @@
-"""The problem of a fit: an image, its regions, a number of Gaussians, and the settings."""
+"""The problem of a fit: images, their regions, a number of Gaussians, and the settings."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_count, check_size
+from kcgs._memory import check_batch_memory
 from kcgs._objectives import Purpose, objective_for
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap, edge_band
 from kcgs.optim import OBJECTIVES, ImageObjective, LossObjective, MsSsim, Objective
 
-from .checks import check_image_and_regions, check_num_gaussians, regions_of
+from .batch_maps import regions_per_map
+from .checks import check_images_and_regions, check_num_gaussians, is_batch, regions_of
 from .config import FitConfig
 from .published.ssim_loss import AbsoluteAndSsim
 from .user_objects import NO_OBJECTS, UserObjects
@@ -23,6 +25,10 @@ from .user_objects import NO_OBJECTS, UserObjects
 _OBJECTIVES: dict[str, type[ImageObjective]] = {**OBJECTIVES, "l1+ssim": AbsoluteAndSsim}
 # of every value, where there is no image
 _GREY = 0.5
+# peak memory of a fit: bytes per pixel, per value of an image, and per Gaussian, measured
+_PIXEL_BYTES = 50
+_CHANNEL_BYTES = 50
+_GAUSSIAN_BYTES = 1000
 # share of an image's values that are 0 or 1 from which on `clamp="auto"` lets Gaussians overshoot them
 _SATURATED_SHARE = 0.25
 
@@ -32,24 +38,31 @@ class Problem:
     """What is to be fitted; nothing here changes during a fit."""
 
     canvas: Tensor
-    """(C, H, W), in [0, 1]: the image, or grey of the size of the render, which the first Gaussians show."""
+    """(B, C, H, W), in [0, 1]: the images, or grey of the size of the render, which the first Gaussians show."""
     regions: RegionMap | None
-    """The map as the user gave it."""
+    """The map as the user gave it, of one image; of more images one for each."""
     num_gaussians: int
-    """N, the most that the result may have."""
+    """N, the most that the result may have for each image."""
     config: FitConfig
     """Its objective is a name, unless `objects` has one."""
     seed: int
     objects: UserObjects = NO_OBJECTS
     has_image: bool = True
     """False: only the objective says what is wanted."""
+    is_batch: bool = False
+    """The user gave a batch, perhaps of one image, and gets one."""
     reduction: int = 1
     """Factor by which the sides of a photo were reduced to those of the image."""
 
     @property
     def image(self) -> Tensor | None:
-        """The image, (C, H, W), if there is one."""
+        """The images, (B, C, H, W), if there are any."""
         return self.canvas if self.has_image else None
+
+    @property
+    def num_images(self) -> int:
+        """B."""
+        return len(self.canvas)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -63,16 +76,18 @@ class Problem:
 
     @cached_property
     def bounds(self) -> tuple[Tensor, Tensor] | None:
-        """The values to which the render is clipped in training, if it is: two tensors (C, H, W), or scalars.
+        """The values to which the render is clipped in training, if it is: two tensors (B, C, H, W), or scalars.
 
-        A clipped value has no gradient, even where it is wrong. So `clamp="auto"` clips at 0 only where the image is 0,
+        A clipped value has no gradient, even where it is wrong. So `clamp="auto"` clips at 0 only where an image is 0,
         and at 1 only where it is 1.
         """
         if self.config.clamp == "auto":
             black, white = self.canvas == 0.0, self.canvas == 1.0
-            if float((black | white).float().mean()) < _SATURATED_SHARE:
+            is_saturated = (black | white).float().mean((1, 2, 3), keepdim=True) >= _SATURATED_SHARE
+            if not bool(is_saturated.any()):
                 return None
-            return torch.where(black, 0.0, -torch.inf), torch.where(white, 1.0, torch.inf)
+            low = torch.where(black & is_saturated, 0.0, -torch.inf)
+            return low, torch.where(white & is_saturated, 1.0, torch.inf)
         return (self.canvas.new_zeros(()), self.canvas.new_ones(())) if self.config.clamp else None
 
     @cached_property
@@ -88,26 +103,30 @@ class Problem:
         """The same pixels as a mask, (..., 1, H, W); None without a map."""
         return None if self.regions is None else edge_band(self.regions.labels).unsqueeze(-3)
 
-    @property
+    @cached_property
     def num_excess_regions(self) -> int:
-        """Regions beyond the number of Gaussians, which are merged or stay black; 0 without guidance."""
+        """Regions of all images beyond the number of Gaussians, which are merged or stay black; 0 without guidance."""
         if self.regions is None or not self.config.guidance:
             return 0
-        return max(0, self.regions.num_regions - self.num_gaussians)
+        return sum(max(0, count - self.num_gaussians) for count in regions_per_map(self.regions))
 
-    @property
-    def chooses_softness(self) -> bool:
-        """True where the softness of contours is to be chosen, and the map came without."""
-        return self.config.softness == "auto" and self.regions is not None and self.regions.softness == 0.0
+    def chooses_softness(self, image: int) -> bool:
+        """Whether the softness of the contours of an image is to be chosen, since its map came without."""
+        softness = None if self.regions is None else self.regions.softness
+        return self.config.softness == "auto" and (softness[image] if isinstance(softness, tuple) else softness) == 0.0
 
     @cached_property
     def objective(self) -> Objective:
         """What the descent lowers."""
         if self.objects.objective is not None:
             return LossObjective(self.objects.objective, self.image)
+        return self.make_objective(self.canvas)
+
+    def make_objective(self, image: Tensor) -> ImageObjective:
+        """Return the objective of the settings for an image, (..., C, H, W)."""
         assert self.config.objective is not None
         kind = _OBJECTIVES[self.config.objective]
-        return MsSsim(self.canvas, self.reduction) if kind is MsSsim else kind(self.canvas)
+        return MsSsim(image, self.reduction) if kind is MsSsim else kind(image)
 
 
 def make_problem(
@@ -134,14 +153,31 @@ def make_problem(
         # what needs an image: contours stay as they are
         update = {"move_contours": False, "merge_regions": False}
         config = config.model_copy(update=update | ({"softness": 0.0} if config.softness == "auto" else {}))
-        canvas = torch.full((check_count("channels", channels), *check_size("size", size)), _GREY)
-        region_map = regions_of(canvas.shape[1:], regions)
+        canvas = torch.full((1, check_count("channels", channels), *check_size("size", size)), _GREY)
+        region_map = regions_of(canvas.shape[2:], regions)
         canvas = canvas if region_map is None else canvas.to(region_map.ids.device)
     elif image is None and size is not None:
         raise InvalidArgument("image", "given, unless objective is a loss of your own", None)
     elif size is not None:
         raise InvalidArgument("size", "None with an image", size)
     else:
-        canvas, region_map = check_image_and_regions(image, regions)
-    count = check_num_gaussians(num_gaussians, canvas)
-    return Problem(canvas, region_map, count, config, check_count("seed", seed, 0, 2**63 - 1), objects, has_image)
+        canvas, region_map = check_images_and_regions(image, regions, keep_batch=purpose == "fit")
+    count, seed = check_num_gaussians(num_gaussians, canvas), check_count("seed", seed, 0, 2**63 - 1)
+    problem = Problem(canvas, region_map, count, config, seed, objects, has_image, is_batch(image) and purpose == "fit")
+    if problem.num_images > 1:
+        _check_batch(problem)
+    return problem
+
+
+def _check_batch(problem: Problem) -> None:
+    """Refuse what takes one image at a time, and more images than there is memory for."""
+    takes_one = {"target_psnr": problem.config.target_psnr, "objective": problem.objects.objective}
+    for name, value in takes_one.items():
+        if value is not None:
+            expected = "a name" if name == "objective" else "None"
+            raise InvalidArgument(
+                name, f"{expected} with {problem.num_images} images: fit them one by one", repr(value)
+            )
+    _, channels, height, width = problem.canvas.shape
+    per_pixel, per_gaussian = _PIXEL_BYTES + channels * _CHANNEL_BYTES, _GAUSSIAN_BYTES
+    check_batch_memory("image", problem.canvas, height * width * per_pixel + problem.num_gaussians * per_gaussian)

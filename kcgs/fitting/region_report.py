@@ -60,15 +60,13 @@ class RegionReport:
 
 
 def report_regions(
-    original: RegionMap | None,
+    original: RegionMap,
     scene: Scene,
     *,
     merged_for_bytes: int = 0,
     dropped: Literal["recipe", "bytes"] | None = None,
-) -> RegionReport | None:
+) -> RegionReport:
     """Compare the user's map with the scene's."""
-    if original is None:
-        return None
     if dropped is not None:
         return RegionReport(original.num_regions, 1, dropped=dropped)
     regions, empty = scene.regions, empty_regions(scene)

@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
+import torch
+from torch import Tensor
+
 from kcgs.plots import history_figure
 from kcgs.scene import Scene
 
@@ -17,6 +20,9 @@ if TYPE_CHECKING:
 
 class HistoryEntry(NamedTuple):
     """One point of the curve of error against run time.
+
+    Of a batch loss, PSNR and EF-PSNR are means over its images, without those that diverged; EF-PSNR also without those
+    that have no contour. The PSNR of an image without error is infinite, and so is the mean.
 
     EF-PSNR is taken along the contours of the user's map, wherever the fit moves them: those of the scene's map are
     what :func:`kcgs.evaluate` looks at by default. NaN without contours.
@@ -34,25 +40,27 @@ class FitResult(NamedTuple):
     """What a fit returns."""
 
     scene: Scene
-    """Without regions where nothing is confined."""
+    """Without regions where nothing is confined; a batch for a batch of images, with as many rows for each image: rows
+    that one has no use for have the colour 0."""
     history: list[HistoryEntry]
     """Its EF-PSNR is along the contours of the user's map, not of the scene's; see :class:`HistoryEntry`."""
     stop_reason: str
     """iterations, seconds, target_psnr, callback or diverged; or what an event of yours returned."""
     config: FitConfig
-    num_pruned: int = 0
-    """Gaussians that were removed at the end since they changed the render by next to nothing."""
-    prune_error: float = 0.0
-    """No value of the render changed by more when they were."""
-    regions: RegionReport | None = None
-    """What became of the label map; None without one."""
+    num_pruned: int | Tensor = 0
+    """Gaussians that were removed at the end since they changed the render by next to nothing; of a batch (B,)."""
+    prune_error: float | Tensor = 0.0
+    """No value of the render changed by more when they were; of a batch (B,)."""
+    regions: RegionReport | list[RegionReport] | None = None
+    """What became of the label map, or of that of each image of a batch; None without one."""
     seconds: float = 0.0
     """Wall time from the start to the pruned scene, without compilation; a search counts all its fits."""
-    psnr: float = math.nan
-    """Of the scene before pruning, in dB; NaN without an image."""
+    psnr: float | Tensor = math.nan
+    """Of the scene before pruning, in dB; of a batch (B,), on the CPU; NaN without an image."""
 
     def __repr__(self) -> str:
-        return f"FitResult({self.psnr:.2f} dB, stopped by {self.stop_reason}, {self.seconds:.1f} s, {self.scene!r})"
+        psnr = float(torch.as_tensor(self.psnr).mean())
+        return f"FitResult({psnr:.2f} dB, stopped by {self.stop_reason}, {self.seconds:.1f} s, {self.scene!r})"
 
     def _repr_png_(self) -> bytes | None:
         return self.scene._repr_png_()

@@ -12,7 +12,7 @@ from kcgs.maps import pairs_to_merge
 from kcgs.nn import GaussianField
 from kcgs.optim import Renderer, draft_cutoff
 
-from .config import FitConfig
+from .batch_maps import join_maps, map_of_each, regions_per_map
 from .initial import initial_sigma, random_field, uniform_field
 from .optimizers import optimizer_kind
 from .problem import Problem
@@ -24,11 +24,10 @@ _INITIALIZERS = {"uniform": uniform_field, "random": random_field, "gradient": g
 
 def start(problem: Problem) -> FitState:
     """Return the state of a fit at its start."""
-    image, config = problem.canvas, problem.config
-    regions = _regions_to_render(image, _as_many_as_gaussians(problem), config)
+    config, regions = problem.config, _regions_to_render(problem)
     share = math.ceil(config.densify_from * problem.num_gaussians)
-    count = min(problem.num_gaussians, max(1 if regions is None else regions.num_regions, share))
-    field = _INITIALIZERS[config.initializer](image, count, regions, problem.seed)
+    count = min(problem.num_gaussians, max(1 if regions is None else max(regions_per_map(regions)), share))
+    field = _INITIALIZERS[config.initializer](problem.canvas, count, regions, problem.seed)
     return make_state(problem, field, regions, count, anchor=regions)
 
 
@@ -49,21 +48,31 @@ def make_state(
     )
 
 
-def _as_many_as_gaussians(problem: Problem) -> RegionMap | None:
-    """Merge regions, where the config lets them merge, until each can have a Gaussian: others would be black."""
-    regions, count = problem.regions, problem.num_gaussians
-    if regions is None or not problem.config.merge_regions or regions.num_regions <= count:
-        return regions
-    return regions.merge(pairs_to_merge(problem.canvas, regions.labels, count))[0]
-
-
-def _regions_to_render(image: Tensor, regions: RegionMap | None, config: FitConfig) -> RegionMap | None:
-    if regions is None or not config.guidance or regions.num_regions == 1:
+def _regions_to_render(problem: Problem) -> RegionMap | None:
+    """Return the map of each image to render with; None where no image has more than one region."""
+    if problem.regions is None or not problem.config.guidance:
         return None
+    maps = map_of_each(problem.regions, problem.num_images)
+    maps = [_map_to_render(image, one, problem) for image, one in zip(problem.canvas, maps, strict=True)]
+    return None if all(one.num_regions == 1 for one in maps) else join_maps(maps)
+
+
+def _map_to_render(image: Tensor, regions: RegionMap, problem: Problem) -> RegionMap:
+    """Return the map of an image with softness, and with at most as many regions as Gaussians where regions merge."""
+    config, count = problem.config, problem.num_gaussians
+    if config.merge_regions and regions.num_regions > count:
+        # until each region can have a Gaussian: others would be black
+        merged, ids = regions.merge(pairs_to_merge(image, regions.labels, count))
+        regions = RegionMap(ids[:1].expand(regions.size)) if merged is None else merged
     # a map with softness of its own knows how sharp its contours are
-    if regions.softness != 0.0 or config.softness == 0.0:
+    if regions.num_regions == 1 or regions.softness != 0.0 or config.softness == 0.0:
         return regions
     if config.softness != "auto":
         return RegionMap.from_labels(regions.labels, config.softness)
+    return with_chosen_softness(image, regions)
+
+
+def with_chosen_softness(image: Tensor, regions: RegionMap) -> RegionMap:
+    """Return a map of an image with the softness of each contour that explains the image best."""
     labels = regions.labels.cpu()
     return RegionMap.from_labels(labels, choose_softness(image, labels)).to(image.device)

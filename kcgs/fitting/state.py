@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
+
+import torch
+from torch import Tensor
 
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap
 from kcgs.optim import FieldState, is_within
 from kcgs.scene import Scene
 
+from .best import Best
 from .problem import Problem
 from .result import HistoryEntry
 
@@ -26,9 +29,9 @@ class FitState(FieldState):
     anchor: RegionMap | None
     """The map that contours may not move far from."""
     num_initial: int
-    """Gaussians at the start."""
+    """Gaussians of each image at the start."""
     num_requested: int
-    """Gaussians that the schedule last asked for; fewer exist where fewer were of use."""
+    """Gaussians of each image that the schedule last asked for; fewer exist where fewer were of use."""
     num_additions: int = 0
     """How often Gaussians were added."""
     num_cycles: int = 0
@@ -36,14 +39,10 @@ class FitState(FieldState):
     num_late_moves: int = 0
     """How often contours moved after densification."""
     history: list[HistoryEntry] = field(default_factory=list)
-    best: Scene | None = None
-    """A copy of the best scene that was measured."""
-    best_is_draft: bool = True
-    """The best was rendered with the cutoff of a draft, and any scene that is none beats it."""
-    best_value: float = math.inf
-    """Squared error of the best, or value of the objective; see `Objective.is_ranked_by_psnr`."""
-    best_psnr: float = math.nan
-    """Of the best, in dB."""
+    best: Best | None = None
+    """The best scene of each image that was measured."""
+    diverged: list[int] = field(default_factory=list)
+    """Images whose numbers were not finite; they keep the best of before."""
 
     def __repr__(self) -> str:
         return f"FitState(iteration {self.iteration}, progress {self.progress:.2f}, {self.scene!r})"
@@ -55,7 +54,7 @@ class FitState(FieldState):
 
     @property
     def num_gaussians(self) -> int:
-        """Gaussians at the moment."""
+        """Gaussians of each image at the moment, with those that have the colour 0."""
         return self.field.num_gaussians
 
     @property
@@ -63,10 +62,13 @@ class FitState(FieldState):
         """True where the cutoff is not yet that of the result."""
         return self.renderer.cutoff != self.problem.config.cutoff
 
-    @property
-    def is_finite(self) -> bool:
-        """True where every number of the field is finite, and far from overflow."""
-        return is_within([self.field.means, self.field.cholesky, self.field.colors], LARGEST)
+    def diverging(self) -> list[int]:
+        """Return the images of which a number is not finite, or near overflow, and that do not count as diverged."""
+        tables = [self.field.means, self.field.cholesky, self.field.colors]
+        if is_within(tables, LARGEST):
+            return []
+        images = (image for image in range(len(tables[0])) if image not in self.diverged)
+        return [image for image in images if not is_within([table[image] for table in tables], LARGEST)]
 
     @property
     def expected_iterations(self) -> float:
@@ -76,42 +78,67 @@ class FitState(FieldState):
             return config.planned_iterations
         return self.iteration / max(self.progress, 1e-9)
 
+    @property
+    def has_diverged(self) -> bool:
+        """True where no image is left."""
+        return len(self.diverged) == self.problem.num_images
+
+    @torch.no_grad()
+    def exclude(self, images: list[int]) -> None:
+        """Count images as diverged: from here on their Gaussians have the colour 0, unless no other image is left."""
+        self.diverged += images
+        if not images or self.has_diverged:
+            return
+        field = self.field
+        for table, fill in ((field.means, 1.0), (field.cholesky, 1.0), (field.colors, 0.0)):
+            table[images] = fill
+        mask = torch.zeros_like(field.means[..., 0], dtype=torch.bool)
+        mask[images] = True
+        self.optimizer.freeze(field, mask)
+
     def end_drafts(self) -> None:
         """Render with the cutoff of the result from here on."""
         self.renderer = self.renderer._replace(cutoff=self.problem.config.cutoff)
 
 
 class Measurement(NamedTuple):
-    """A scene that was rendered, and when."""
+    """Scenes that were rendered, and when."""
 
     iteration: int
     seconds: float
     scene: Scene  # a copy, since the fit goes on
     is_draft: bool
+    excluded: list[int]  # images of it that had diverged
 
 
 class Errors(NamedTuple):
-    """Mean errors of a render."""
+    """Mean errors of a render of each image, (B,)."""
 
-    objective: float
-    squared: float  # once it is clipped to [0, 1]; NaN without an image
-    squared_near_contours: float  # the same in the band of EF-PSNR; NaN without contours
+    objective: Tensor
+    squared: Tensor  # once it is clipped to [0, 1]; NaN without an image
+    squared_near_contours: Tensor  # the same in the band of EF-PSNR; NaN without contours
 
 
 def record(state: FitState, measurement: Measurement, errors: Errors) -> None:
-    """Put a measurement into the history, and keep its scene if it is the best; one of NaN does not count."""
-    iteration, seconds, scene, is_draft = measurement
-    if math.isnan(errors.objective):
-        if not state.history:
-            raise InvalidArgument("objective", "a number at the first Gaussians of a fit", "NaN")
+    """Put a measurement into the history, and keep the scenes that are the best; those of NaN do not count."""
+    iteration, seconds, scene, is_draft, excluded = measurement
+    errors = Errors(*(column.to("cpu", torch.float64, copy=True) for column in errors))
+    for column in errors:
+        column[excluded] = torch.nan
+    is_missing = errors.objective.isnan()
+    if not state.history and bool(is_missing.any()):
+        raise InvalidArgument("objective", "a number at the first Gaussians of a fit", "NaN")
+    if bool(is_missing.all()):
         return
     psnr, ef_psnr = _decibel(errors.squared), _decibel(errors.squared_near_contours)
-    state.history.append(HistoryEntry(iteration, seconds, errors.objective, psnr, ef_psnr, scene.num_gaussians))
+    loss, mean_psnr, mean_ef_psnr = (float(numbers.nanmean()) for numbers in (errors.objective, psnr, ef_psnr))
+    state.history.append(HistoryEntry(iteration, seconds, loss, mean_psnr, mean_ef_psnr, scene.num_gaussians))
     value = errors.squared if state.objective.is_ranked_by_psnr else errors.objective
-    if (is_draft, value) < (state.best_is_draft, state.best_value):
-        state.best, state.best_is_draft, state.best_value, state.best_psnr = scene, is_draft, value, psnr
+    drafts = torch.full_like(is_missing, is_draft)
+    measured = Best(scene.field, [scene.regions] * len(value), drafts, value, psnr)
+    state.best = measured if state.best is None else state.best.improved_by(measured)
 
 
-def _decibel(mean_square: float) -> float:
-    """PSNR of a mean squared error, for values in [0, 1]."""
-    return math.inf if mean_square == 0 else -10.0 * math.log10(mean_square)
+def _decibel(mean_square: Tensor) -> Tensor:
+    """Return the PSNR of mean squared errors, for values in [0, 1]."""
+    return -10.0 * mean_square.log10()

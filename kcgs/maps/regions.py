@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from kcgs._check import check_size
 from kcgs._labels import check_labels
+from kcgs.errors import InvalidArgument
 
 from .derived import table_at
 from .labels import compact, positions_of, sample_labels, union_find
@@ -184,6 +185,26 @@ class RegionMap:
         parts = [full_map(table, 0, place) for place in places if place >= 0]
         black = torch.zeros(self.size, dtype=torch.float64, device=self.ids.device)
         return (sum(parts[1:], parts[0]) if parts else black).to(dtype)
+
+    @classmethod
+    def stack(cls, maps: Sequence[RegionMap]) -> RegionMap:
+        """Make a batch of maps of one image each, with the softness of each; an index is the reverse.
+
+        Args:
+            maps: at least one, all of one size.
+
+        Raises:
+            ValueError: no maps, batches, or maps of several sizes.
+
+        Example:
+            >>> batch = RegionMap.stack([RegionMap(torch.tensor([[1, 2]]), 0.5), RegionMap(torch.tensor([[7, 7]]))])
+            >>> batch.labels.shape, batch.softness
+            (torch.Size([2, 1, 2]), (0.5, 0.0))
+        """
+        sizes = {(one.num_maps, one.size) for one in maps}
+        if len(sizes) != 1 or maps[0].num_maps is not None:
+            raise InvalidArgument("maps", "at least one, each of one image and all of one size", sizes or "none")
+        return cls(torch.stack([one._labels for one in maps]), [one._softness for one in maps])  # type: ignore[misc]
 
     def relabel(self, labels: Tensor, new_contours: Literal["hard", "mean"] = "hard") -> RegionMap:
         r"""Make the map of other labels, with the softness of this one.

@@ -46,7 +46,7 @@ class FieldState:
         self.renderer = self.renderer._replace(regions=regions)
 
     def render(self) -> Tensor:
-        """Render (C, H, W), with a graph."""
+        """Render (..., C, H, W), with a graph."""
         return self.renderer.render(self.gaussians)
 
 

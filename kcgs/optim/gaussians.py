@@ -33,6 +33,10 @@ class Gaussians(NamedTuple):
         """Take those of a field, without the graph; opacities are merged into the colours."""
         return cls(field.means.detach(), field.cholesky.detach(), field.merged_colors().detach(), field.region_ids)
 
+    def of_image(self, index: int) -> Gaussians:
+        """Return those of one image of a batch."""
+        return Gaussians(*(table if table is None else table[index] for table in self))  # type: ignore[arg-type]
+
     def field(self, size: tuple[int, int]) -> GaussianField:
         """Copy them into a field."""
         return GaussianField(*self, size=size)
@@ -45,23 +49,30 @@ class Gaussians(NamedTuple):
 
 
 class Renderer(NamedTuple):
-    """Renders Gaussians of one image, with one map, cutoff and backend."""
+    """Renders Gaussians of an image or a batch, with one map or one for each, a cutoff and a backend."""
 
     size: tuple[int, int]
     regions: RegionMap | None = None
     cutoff: float = _DRAFT_CUTOFF
     backend: str = "auto"
     bounds: tuple[Tensor, Tensor] | None = None
-    """Values to which the render is clipped, (C, H, W) or scalars; a clipped value has no gradient."""
+    """Values to which the render is clipped, (..., C, H, W) or scalars; a clipped value has no gradient."""
+
+    def of_image(self, index: int, regions: RegionMap | None) -> Renderer:
+        """Return the renderer of one image of a batch, with its map."""
+        bounds = self.bounds
+        if bounds is not None and bounds[0].ndim:
+            bounds = bounds[0][index], bounds[1][index]
+        return self._replace(regions=regions, bounds=bounds)
 
     def render(self, gaussians: Gaussians) -> Tensor:
-        """Render (C, H, W)."""
+        """Render (..., C, H, W)."""
         render = region_splat(*gaussians, self.regions, size=self.size, cutoff=self.cutoff, backend=self.backend)
         return render if self.bounds is None else render.clamp(*self.bounds)
 
     def squared_error(self, gaussians: Gaussians, image: Tensor) -> Tensor:
-        """Return the squared error of each pixel, (H, W), channels averaged."""
-        return (self.render(gaussians).detach() - image).square().mean(0)
+        """Return the squared error of each pixel, (..., H, W), channels averaged."""
+        return (self.render(gaussians).detach() - image).square().mean(-3)
 
     def squared_error_gradients(self, gaussians: Gaussians, image: Tensor) -> Gaussians:
         """Return half the gradients of the squared error of the render as it is, summed over pixels, in one pass."""

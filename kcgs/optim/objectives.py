@@ -131,7 +131,7 @@ class LossObjective(Objective):
 
     Args:
         loss: from a render, (1, C, H, W), to a scalar.
-        image: (C, H, W). Gaussians are added where the render differs from it; None: where the loss has its slope.
+        image: (1, C, H, W). Gaussians are added where the render differs from it; None: where the loss has its slope.
     """
 
     is_ranked_by_psnr = False
@@ -143,15 +143,15 @@ class LossObjective(Objective):
         """Return the gradient, times the number of values, as if the loss were their mean."""
         leaf = render.detach().requires_grad_()
         with torch.enable_grad():
-            loss = self._check(self.loss(leaf[None]))
+            loss = self._check(self.loss(leaf))
         if not loss.requires_grad:
             raise InvalidArgument("objective", "a loss that depends on the render", "one without a graph")
         return torch.autograd.grad(loss, leaf)[0] * leaf.numel()
 
     @torch.no_grad()
     def value(self, render: Tensor) -> Tensor:
-        """Return the loss."""
-        return self._check(self.loss(render.detach()[None]))
+        """Return the loss, (1,)."""
+        return self._check(self.loss(render.detach())).reshape(1)
 
     def residual(self, render: Tensor) -> Residual:
         """Return what the render lacks of the image; without one, the step along the slope that lowers the loss most.

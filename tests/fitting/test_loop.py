@@ -195,7 +195,8 @@ class TestSwitches:
         bounds = make_problem(image, None, 1, FitConfig(), 0).bounds
         assert bounds is not None
         for outside, clipped in ((2.0, [2.0, 1.0, 2.0, 2.0]), (-1.0, [0.0, -1.0, -1.0, -1.0])):
-            assert torch.equal(torch.full((1, 6, 4), outside).clamp(*bounds), torch.tensor(clipped).expand(1, 6, 4))
+            clamped = torch.full((1, 1, 6, 4), outside).clamp(*bounds)
+            assert torch.equal(clamped, torch.tensor(clipped).expand(1, 1, 6, 4))
 
     @pytest.mark.parametrize("objective", ["l1", "l2"])
     @pytest.mark.parametrize("optimizer", ["adam", "adan"])
@@ -229,11 +230,11 @@ class TestSwitches:
         image, labels = disc()
         state = start(make_problem(image, labels, 2, quick(), 0))
         first = state.field.region_ids.clone()
-        assert sorted(first.tolist()) == [0, 1]
+        assert sorted(first[0].tolist()) == [0, 1]
         state.field.means.data[:] = torch.tensor([20.0, 16.0])  # all are under label 1
         state.iteration = 1
         Warmup().act(state)
-        assert sorted(state.field.region_ids.tolist()) == [0, 1]
+        assert sorted(state.field.region_ids[0].tolist()) == [0, 1]
 
     def test_the_map_of_tanh_and_signs_of_gaussian_image(self) -> None:
         """A factor whose column has changed its sign is the same Gaussian."""
@@ -300,7 +301,8 @@ class TestErrors:
         [
             ({"image": None}, TypeError, "image must be a Tensor"),
             ({"image": torch.zeros(4, 4)}, ValueError, "image must have 3 or 4 dimensions"),
-            ({"image": torch.zeros(2, 3, 4, 4)}, ValueError, "image must be one image"),
+            ({"image": torch.zeros(2, 5, 5, 3)}, ValueError, r"image must be \(C, H, W\)"),
+            ({"image": torch.zeros(0, 3, 4, 4)}, ValueError, "image must not be empty"),
             (
                 {"image": torch.full((3, 4, 4), 2.0)},
                 ValueError,

@@ -102,7 +102,7 @@ class TestLoss:
         for objective in ("l2", "l1", "ms-ssim", "l1+ssim"):
             result = fit(image(), None, 40, iterations=30, objective=objective, prune=0.0)
             problem = make_problem(image(), None, 40, result.config, 0)
-            value = float(problem.objective.value(result.scene().detach()))
+            value = float(problem.objective.value(result.scene().detach()[None]))
             assert min(entry.loss for entry in result.history) == pytest.approx(value, rel=1e-4)
 
     @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -15,7 +16,12 @@ from kcgs.fitting.published.gradient_start import gradient_field
 from kcgs.functional import lookup_regions, region_splat
 from kcgs.nn import GaussianField
 
-START = {"gradient": gradient_field, "random": random_field, "uniform": initial_field}
+
+def of_one_image(start: Callable[..., GaussianField]) -> Callable[..., GaussianField]:
+    return lambda image, *arguments: start(image[None], *arguments)[0]
+
+
+START = {"gradient": of_one_image(gradient_field), "random": of_one_image(random_field), "uniform": initial_field}
 
 
 def scene(size: tuple[int, int] = (48, 64), channels: int = 3) -> tuple[Tensor, Tensor]:
@@ -75,18 +81,18 @@ class TestEvery:
 
 class TestGradient:
     def test_centres_follow_the_detail(self) -> None:
-        field = gradient_field(scene()[0], 200, None, 0)
+        field = START["gradient"](scene()[0], 200, None, 0)
         share = float((field.means[:, 0] < 32).float().mean())
         assert share > 0.7
 
     def test_flat_image_is_covered_evenly_at_its_level(self) -> None:
         image = torch.full((1, 60, 60), 0.4)
-        field = gradient_field(image, 200, None, 0)
+        field = START["gradient"](image, 200, None, 0)
         assert float((field.means[:, 0] < 30).float().mean()) == pytest.approx(0.5, abs=0.1)
         assert float(draw(field, None)[:, 10:-10, 10:-10].mean()) == pytest.approx(0.4, rel=0.15)
 
     def test_no_pixel_twice(self) -> None:
-        assert len(gradient_field(scene()[0], 1000, None, 0).means.floor().unique(dim=0)) == 1000
+        assert len(START["gradient"](scene()[0], 1000, None, 0).means.floor().unique(dim=0)) == 1000
 
 
 class TestInitialField:
@@ -132,7 +138,7 @@ class TestInitialField:
         [
             ({"image": torch.zeros(3, 1, 4, 4), "regions": torch.zeros(2, 4, 4).long()}, ValueError,
              r"regions must be one map, or one for each of 3 images, of the image's size \(4, 4\); got \(2, 4, 4\)"),
-            ({"image": torch.zeros(0, 1, 4, 4)}, ValueError, "image must be one image"),
+            ({"image": torch.zeros(0, 1, 4, 4)}, ValueError, "image must not be empty"),
             ({"image": 3}, TypeError, "image must be a Tensor"),
             ({"num_gaussians": 0}, ValueError, "num_gaussians must be at least 1; got 0"),
             ({"num_gaussians": 50}, ValueError, "num_gaussians must be at most 16"),

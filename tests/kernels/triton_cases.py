@@ -211,14 +211,14 @@ def test_without_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
     expected = evaluate(cuda, inputs)
     with without_waiting():
         assert all(torch.equal(a, b) for a, b in zip(evaluate(cuda, inputs), expected, strict=True))
-        assert not settle(inputs.means.device, inputs.size)
+        assert not settle(inputs.means.device, inputs.num_images, inputs.size)
         assert all(t.isnan().all() for t in evaluate(cuda, large))
-        assert settle(inputs.means.device, inputs.size)
+        assert settle(inputs.means.device, inputs.num_images, inputs.size)
         assert all(t.isfinite().all() for t in evaluate(cuda, large))
-        assert not settle(inputs.means.device, inputs.size)
+        assert not settle(inputs.means.device, inputs.num_images, inputs.size)
         assert evaluate(cuda, inputs._replace(colors=inputs.colors / 0))[0].isnan().all()
         evaluate(cuda, inputs)
-    assert settle(inputs.means.device, inputs.size)
+    assert settle(inputs.means.device, inputs.num_images, inputs.size)
     capacity.notes_of(inputs.means.device)[1] = 1
     with pytest.warns(UserWarning, match="1 renders of a CUDA graph are NaN: their Gaussians were not finite"):
         evaluate(cuda, inputs)

@@ -73,7 +73,7 @@ class TestLoss:
 
     def test_what_is_no_loss_is_refused(self) -> None:
         for loss, words in (
-            (lambda render: render, r"a function that returns a scalar tensor; got shape \(1, 3, 24, 40\)"),
+            (lambda render: render, r"a function that returns a scalar tensor; got shape \(3, 24, 40\)"),
             (lambda render: 1.0, "a function that returns a scalar tensor; got float"),
             (lambda render: torch.zeros(()), "a loss that depends on the render"),
         ):

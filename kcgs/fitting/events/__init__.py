@@ -7,11 +7,11 @@ by ``append`` and ``keep`` of the state's optimizer. Others observe.
 
 from .contours import AdaptContours, SettleContours
 from .densify import Densify
-from .divergence import StopAtDivergence
+from .divergence import HandleDivergence
 from .drafts import EndDrafts
 from .log import Log
 from .report import OnStep, Report
 
 __all__ = [
-    "AdaptContours", "Densify", "EndDrafts", "Log", "OnStep", "Report", "SettleContours", "StopAtDivergence",
+    "AdaptContours", "Densify", "EndDrafts", "HandleDivergence", "Log", "OnStep", "Report", "SettleContours",
 ]  # fmt: skip

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from operator import is_not
 
 import torch
 
+from kcgs.fitting.batch_maps import join_maps, map_of, map_of_each
 from kcgs.fitting.contour_moves import move_contours
+from kcgs.fitting.start import with_chosen_softness
 from kcgs.fitting.state import FitState
-from kcgs.functional import RegionMap, choose_softness
+from kcgs.functional import RegionMap
+from kcgs.optim import Gaussians
 
 
 @dataclass(frozen=True)
@@ -30,20 +35,38 @@ class AdaptContours:
         if state.num_additions % self.additions_per_move:
             return
         _move_contours(state, self.max_rise)
-        regions, problem = state.regions, state.problem
         is_turn = state.num_additions % self.additions_per_softness == self.additions_per_move
-        if regions is not None and problem.chooses_softness and is_turn:
-            labels = regions.labels.cpu()
-            chosen = RegionMap.from_labels(labels, choose_softness(problem.canvas, labels))
-            state.regions = chosen.to(problem.device)
+        if state.regions is not None and is_turn:
+            _replace_maps(state, _choose_softness)
+
+
+def _replace_maps(state: FitState, replace: Callable[[FitState, int, RegionMap], RegionMap]) -> None:
+    """Replace the map of each image by a function of the state, the image's number and its map."""
+    assert state.regions is not None
+    before = map_of_each(state.regions, state.problem.num_images)
+    after = [replace(state, image, regions) for image, regions in enumerate(before)]
+    if any(map(is_not, after, before)):
+        state.regions = join_maps(after)
+
+
+def _choose_softness(state: FitState, image: int, regions: RegionMap) -> RegionMap:
+    """Choose the softness of contours anew, where the settings ask for it."""
+    problem = state.problem
+    return with_chosen_softness(problem.canvas[image], regions) if problem.chooses_softness(image) else regions
 
 
 def _move_contours(state: FitState, max_rise: float) -> None:
     """Move the contours where that raises the squared error about them by no more than a factor."""
-    image, config = state.problem.image, state.problem.config
-    if state.regions is None or state.anchor is None or image is None:
+    images, anchor, config = state.problem.image, state.anchor, state.problem.config
+    if state.regions is None or anchor is None or images is None:
         return
-    state.regions = move_contours(state.gaussians, state.renderer, image, state.anchor.labels, config, max_rise)
+    gaussians = Gaussians.of(state.field)
+
+    def moved(state: FitState, image: int, regions: RegionMap) -> RegionMap:
+        renderer, labels = state.renderer.of_image(image, regions), map_of(anchor, image).labels
+        return move_contours(gaussians.of_image(image), renderer, images[image], labels, config, max_rise)
+
+    _replace_maps(state, moved)
 
 
 @dataclass(frozen=True)

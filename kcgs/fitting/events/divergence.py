@@ -7,15 +7,21 @@ from kcgs.fitting.state import FitState
 from kcgs.fitting.steppers import Stepper
 
 
-class StopAtDivergence:
-    """Ends a fit with a number that is not finite, or near overflow."""
+class HandleDivergence:
+    """Freezes images with a number that is not finite, or near overflow; ends a fit of which no other image is left."""
 
     def __init__(self, stepper: Stepper) -> None:
         self._stepper = stepper
 
     def act(self, state: FitState) -> str | None:
-        """Check, warn, and return why the fit ends."""
-        if not self._stepper.has_diverged():
+        """Check, warn, and freeze, or return why the fit ends."""
+        images = self._stepper.diverging()
+        if not images:
             return None
-        warn_user(f"the fit diverged at iteration {state.iteration}: the best so far is kept")
-        return "diverged"
+        if state.problem.num_images == 1:
+            warn_user(f"the fit diverged at iteration {state.iteration}: the best so far is kept")
+        else:
+            numbers = ", ".join(map(str, images))
+            warn_user(f"images {numbers} diverged at iteration {state.iteration}: the best so far of each is kept")
+        state.exclude(images)
+        return "diverged" if state.has_diverged else None

@@ -47,7 +47,10 @@ class GaussianImageAdan(PublishedOptimizer):
     def encode(self, field: GaussianField) -> list[Tensor]:
         """Return the centres before tanh, factors and colours."""
         means, cholesky, colors = field.means.detach(), field.cholesky.detach(), field.merged_colors().detach()
-        return [torch.atanh((2 * means / self.extent - 1).clamp(-_EDGE, _EDGE)), cholesky, colors]
+        centres = (2 * means / self.extent - 1).clamp(-_EDGE, _EDGE)
+        # one image after the other: the last bit of torch's atanh depends on a number's place in memory
+        parts = [torch.atanh(image) for image in centres.view(-1, *centres.shape[-2:])]
+        return [torch.stack(parts).view_as(centres), cholesky, colors]
 
     def decode(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return means, cholesky with positive diagonal, colors."""

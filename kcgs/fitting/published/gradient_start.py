@@ -18,8 +18,13 @@ _GRADIENT_SHARE = 0.7
 _MIN_SIGMA = 0.5
 
 
-def gradient_field(image: Tensor, num_gaussians: int, regions: RegionMap | None, seed: int) -> GaussianField:
-    """Sample centres where the image changes, as Image-GS does: 0.7 Sobel gradient magnitude + 0.3 uniform."""
+def gradient_field(images: Tensor, num_gaussians: int, regions: RegionMap | None, seed: int) -> GaussianField:
+    """Sample centres where images (B, C, H, W) change, as Image-GS does: 0.7 Sobel gradient magnitude + 0.3 uniform."""
+    field = GaussianField.stack([_field_of_image(image, num_gaussians, seed) for image in images])
+    return field if regions is None else field.assign_regions(regions)
+
+
+def _field_of_image(image: Tensor, num_gaussians: int, seed: int) -> GaussianField:
     from scipy.ndimage import sobel
 
     rng = np.random.default_rng(seed)
@@ -33,5 +38,4 @@ def gradient_field(image: Tensor, num_gaussians: int, regions: RegionMap | None,
     colors = planes.reshape(len(planes), -1).T[pixels] / OVERLAP
     cholesky = np.stack([sigma, np.zeros_like(sigma), sigma], -1)
     tensors = (torch.from_numpy(values).to(image) for values in (centres, cholesky, colors))
-    field = GaussianField(*tensors, size=(image.shape[1], image.shape[2]))
-    return field if regions is None else field.assign_regions(regions)
+    return GaussianField(*tensors, size=(image.shape[1], image.shape[2]))

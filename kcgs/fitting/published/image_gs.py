@@ -30,14 +30,14 @@ class ImageGSAdam(PublishedOptimizer):
         l11, l21, l22 = cholesky.unbind(-1)
         factor = torch.stack([l11, torch.zeros_like(l11), l21, l22], -1).unflatten(-1, (2, 2))
         axes, scales, _ = torch.linalg.svd(factor)
-        angle = torch.atan2(axes[:, 1, 0], axes[:, 0, 0])
-        return [means / self.extent, 1 / scales, angle[:, None], colors]
+        angle = torch.atan2(axes[..., 1, 0], axes[..., 0, 0])
+        return [means / self.extent, 1 / scales, angle[..., None], colors]
 
     def decode(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return means, cholesky, colors."""
         centres, inverse_scales, angles, colors = self.parameters
         s1, s2 = (1 / inverse_scales.abs().clamp(1 / self.limit, 1 / MIN_SIGMA)).unbind(-1)
-        cos, sin = torch.cos(angles[:, 0]), torch.sin(angles[:, 0])
+        cos, sin = torch.cos(angles[..., 0]), torch.sin(angles[..., 0])
         # R diag(s1, s2)^2 R^T = L L^T
         l11 = torch.sqrt((cos * s1) ** 2 + (sin * s2) ** 2)
         l21 = cos * sin * (s1**2 - s2**2) / l11

@@ -30,12 +30,15 @@ class DensifyAtLargestError(Densify):
             return
         problem, (_, width) = state.problem, state.problem.size
         residual = state.objective.residual(state.render().detach()).error
-        error = residual.square().mean(0).flatten().double().cpu().numpy() + 1e-12
-        rng = np.random.default_rng((problem.seed, state.num_additions))
-        pixels = torch.from_numpy(sample_pixels(error, count, rng)).to(residual.device)
+        errors = residual.square().mean(1).flatten(1).double().cpu().numpy() + 1e-12
+        seed = (problem.seed, state.num_additions)
+        samples = np.stack([sample_pixels(error, count, np.random.default_rng(seed)) for error in errors])
+        pixels = torch.from_numpy(samples).to(residual.device)
         means = torch.stack([pixels % width, pixels // width], -1).to(residual.dtype) + 0.5
-        sigma = means.new_full((count,), initial_sigma(problem.size, problem.num_gaussians))
+        sigma = torch.full_like(means[..., 0], initial_sigma(problem.size, problem.num_gaussians))
         ids = None if state.regions is None else lookup_regions(means, state.regions.labels)
         cholesky = torch.stack([sigma, torch.zeros_like(sigma), sigma], -1)
-        added = GaussianField(means, cholesky, residual.flatten(1)[:, pixels].T, ids, size=problem.size)
+        places = pixels[:, None].expand(-1, residual.shape[1], -1)
+        colors = residual.flatten(2).gather(2, places).mT
+        added = GaussianField(means, cholesky, colors, ids, size=problem.size)
         state.optimizer.append(state.field, added)

@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import pad
 from torch.optim import Optimizer
 
 from kcgs.nn import GaussianField
@@ -35,16 +36,17 @@ class PublishedOptimizer(ABC):
         height, width = field.size
         self.field, self.rates, self.make = field, rates, make
         self.limit = max_sigma * math.hypot(height, width)
+        self.frozen: Tensor | None = None  # [..., N, 1]
         self.extent = field.means.detach().new_tensor([width, height])
         self._set(self.encode(field))
 
     @abstractmethod
     def encode(self, field: GaussianField) -> list[Tensor]:
-        """Return the parameters of a field's Gaussians; the colours as they are come last."""
+        """Return the parameters of a field's Gaussians, (..., N, K); the colours as they are come last."""
 
     @abstractmethod
     def decode(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return means (N, 2), cholesky (N, 3) and colors (N, C) of the parameters, with their graph."""
+        """Return means, cholesky and colors of the parameters, with their graph."""
 
     @property
     def param_groups(self) -> list[dict[str, Any]]:
@@ -54,6 +56,8 @@ class PublishedOptimizer(ABC):
     def step(self) -> None:
         """Move by the gradients of the field."""
         gradients = [tensor.grad for tensor in self._tensors()]
+        if self.frozen is not None:
+            gradients = [None if grad is None else grad.masked_fill(self.frozen, 0.0) for grad in gradients]
         torch.autograd.backward(self._gaussians, gradients)
         self.optimizer.step()
         self.optimizer.zero_grad()
@@ -67,15 +71,28 @@ class PublishedOptimizer(ABC):
     def append(self, field: GaussianField, added: GaussianField) -> None:
         """Add the Gaussians of another field."""
         if field.region_ids is not None and added.region_ids is not None:
-            field.region_ids = torch.cat([field.region_ids, added.region_ids])
+            field.region_ids = torch.cat([field.region_ids, added.region_ids], -1)
+        if self.frozen is not None:
+            self.frozen = pad(self.frozen, (0, 0, 0, added.num_gaussians))
         pairs = zip(self.parameters, self.encode(added), strict=True)
-        self._set([torch.cat([old.detach(), new]) for old, new in pairs])
+        self._set([torch.cat([old.detach(), new], -2) for old, new in pairs])
 
     def keep(self, field: GaussianField, mask: Tensor) -> None:
-        """Remove all Gaussians but those of a mask (N)."""
+        """Remove all Gaussians but those of a mask, (..., N)."""
+
+        def select(table: Tensor) -> Tensor:
+            return table[mask].view(*mask.shape[:-1], -1, table.shape[-1])
+
         if field.region_ids is not None:
-            field.region_ids = field.region_ids[mask]
-        self._set([old.detach()[mask] for old in self.parameters])
+            field.region_ids = select(field.region_ids[..., None])[..., 0]
+        if self.frozen is not None:
+            self.frozen = select(self.frozen)
+        self._set([select(old.detach()) for old in self.parameters])
+
+    def freeze(self, field: GaussianField, mask: Tensor) -> None:
+        """Leave Gaussians of a mask, (..., N), as they are from here on; the averages of all start anew."""
+        self.frozen = mask[..., None] if self.frozen is None else self.frozen | mask[..., None]
+        self._set(self.encode(field))
 
     def state_dict(self) -> dict[str, Any]:
         """Return parameters and averages."""

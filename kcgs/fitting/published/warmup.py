@@ -27,6 +27,7 @@ class Warmup:
             return
         assert field.region_ids is not None
         ids = lookup_regions(field.means, regions.labels)
-        occupied = torch.zeros(regions.num_regions, dtype=torch.bool, device=ids.device)
-        occupied[regions.index_of(ids)] = True
-        field.region_ids = torch.where(occupied[regions.index_of(field.region_ids)], ids, field.region_ids)
+        occupied = torch.zeros(len(ids), regions.num_regions, dtype=torch.bool, device=ids.device)
+        occupied.scatter_(1, regions.index_of(ids), True)
+        is_free = occupied.gather(1, regions.index_of(field.region_ids))
+        field.region_ids = torch.where(is_free, ids, field.region_ids)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
@@ -54,7 +53,7 @@ class CudaStepper:
         state, rendered = self._state, self._rendered
         self._rendered = None
         if self._must_wait():
-            settle(state.problem.device, state.problem.size)
+            self._settle()
             self._graph.forget()
         set_rates(state, rate)
         with self._running_ahead():
@@ -70,7 +69,7 @@ class CudaStepper:
         state = self._state
         with self._running_ahead():
             self._rendered = state.render()
-            errors = self._read_back(measure_errors(state.problem, self._rendered))
+            errors = self._read_back(torch.stack(measure_errors(state.problem, self._rendered)))
         # of the Gaussians as they are now, since only the errors say whether they are the best
         self._pending.append((snapshot(state, seconds), errors))
         self.poll(wait=not state.history)
@@ -81,25 +80,32 @@ class CudaStepper:
             measurement, errors = self._pending.popleft()
             record(self._state, measurement, Errors(*errors.numbers()))
         if wait:
-            settle(self._state.problem.device, self._state.problem.size)
+            self._settle()
 
-    def has_diverged(self) -> bool:
+    def diverging(self) -> list[int]:
         """See :class:`Stepper`; up to 20 iterations late.
 
         Every ten iterations the host waits for the numbers of ten iterations before. There it also learns whether a
         step had no room.
         """
         if self._state.iteration % _ITERATIONS_PER_CHECK:
-            return False
+            return []
         field = self._state.field
         tables = [field.means, field.cholesky, field.colors]
         gradients = [table.grad for table in tables if table.grad is not None]
         previous, self._magnitudes = self._magnitudes, self._read_back(_magnitudes([*tables, *gradients]))
         if previous is None:
-            return False
-        numbers, columns = previous.numbers(), sum(table.shape[1] for table in tables)
-        self._lacks_room |= any(map(math.isnan, numbers[columns:]))
-        return not all(number < LARGEST for number in numbers[:columns])
+            return []
+        numbers, columns = previous.numbers(), sum(table.shape[-1] for table in tables)
+        self._lacks_room |= bool(numbers[:, columns:].isnan().any())
+        is_within = (numbers[:, :columns] < LARGEST).all(1)
+        is_within[self._state.diverged] = True
+        return (~is_within).nonzero()[:, 0].tolist()
+
+    def _settle(self) -> None:
+        """Wait, and make room for what did not fit."""
+        problem = self._state.problem
+        settle(problem.device, problem.num_images, problem.size)
 
     def _content(self) -> list[object]:
         """Return what a step moves and renders with, which events replace."""
@@ -129,5 +135,5 @@ class CudaStepper:
 
 @torch.no_grad()
 def _magnitudes(tables: list[Tensor]) -> Tensor:
-    """Return the largest absolute number of each column of tables, (N, K) each; a NaN is the largest."""
-    return torch.cat(tables, -1).abs().amax(0)
+    """Return the largest absolute number of each image's columns, (B, K), of tables; a NaN is the largest."""
+    return torch.cat(tables, -1).abs().amax(1)

@@ -7,7 +7,7 @@ from typing import Protocol
 from torch import Tensor
 
 from kcgs.fitting.measurement import measure_errors, snapshot
-from kcgs.fitting.state import Errors, FitState, record
+from kcgs.fitting.state import FitState, record
 from kcgs.optim import step_field
 
 
@@ -23,8 +23,8 @@ class Stepper(Protocol):
     def poll(self, *, wait: bool = False) -> None:
         """Record the measurements that the device is done with; `wait`: all of them."""
 
-    def has_diverged(self) -> bool:
-        """Whether a number of the field is not finite, or near overflow."""
+    def diverging(self) -> list[int]:
+        """Return the images that begin to diverge: see :meth:`FitState.diverging`."""
 
 
 class EagerStepper:
@@ -43,12 +43,11 @@ class EagerStepper:
         """See :class:`Stepper`."""
         state = self._state
         self._rendered = state.render()
-        errors = Errors(*measure_errors(state.problem, self._rendered).tolist())
-        record(state, snapshot(state, seconds), errors)
+        record(state, snapshot(state, seconds), measure_errors(state.problem, self._rendered))
 
     def poll(self, *, wait: bool = False) -> None:
         """See :class:`Stepper`: all measurements are recorded."""
 
-    def has_diverged(self) -> bool:
+    def diverging(self) -> list[int]:
         """See :class:`Stepper`."""
-        return not self._state.is_finite
+        return self._state.diverging()

@@ -22,9 +22,8 @@ class Readback:
         """True once `numbers` need not wait."""
         return self._copied is None or self._copied.query()
 
-    def numbers(self) -> list[float]:
-        """Return the numbers, and wait for them where they have not arrived."""
+    def numbers(self) -> Tensor:
+        """Return the numbers in float64 on the host, and wait for them where they have not arrived."""
         if self._copied is not None:
             self._copied.synchronize()
-        values: list[float] = self._numbers.tolist()
-        return values
+        return self._numbers.double()

@@ -97,14 +97,15 @@ def report(full: int, not_finite: int, most: int) -> None:
         warn_user(f"{not_finite} renders of a CUDA graph are NaN: their Gaussians were not finite, or out of range")
 
 
-def settle(device: torch.device, size: tuple[int, int]) -> bool:
+def settle(device: torch.device, num_images: int, size: tuple[int, int]) -> bool:
     """Make room for what did not fit within `without_waiting` since the last time; return whether anything failed."""
     notes = _notes.get((device, False))
     if notes is None:
         return False
     full, not_finite, most = notes.tolist()
     notes.zero_()
-    _most[device, 1, size] = max(most, _most.get((device, 1, size), 0))
+    key = device, num_images, size
+    _most[key] = max(most, _most.get(key, 0))
     return bool(full or not_finite)
 
 
