@@ -1,7 +1,8 @@
 """Optimizers of Gaussians."""
 
+from .adam import is_within
 from .descent import FieldState, move_field, set_rates, step_field
-from .gaussian_adam import COLOR_LEARNING_RATE, LEARNING_RATE, GaussianAdam, is_within
+from .gaussian_adam import COLOR_LEARNING_RATE, LEARNING_RATE, GaussianAdam
 from .gaussians import Gaussians, Renderer, draft_cutoff
 from .ms_ssim import MsSsim
 from .newton import NewtonDescent, self_product

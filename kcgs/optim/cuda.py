@@ -1,4 +1,4 @@
-"""The steps of `gaussian_adam.py` in one launch of Triton: a thread moves a Gaussian, float32, on a CUDA device.
+"""The steps of `adam.py` in one launch of Triton: a thread moves a Gaussian, float32, on a CUDA device.
 
 Numbers in between are float64, as in `loops.py`. A Gaussian that is frozen, by a negative age, or whose gradient is not
 finite, stays as it is.

@@ -2,37 +2,23 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.autograd.graph import increment_version
 from torch.nn.functional import pad
 from torch.optim import Optimizer
 
-from kcgs._check import check_number, verify
+from kcgs._check import check_number
 from kcgs.errors import InvalidArgument, InvalidArgumentType
-from kcgs.kernels import takes_triton
 from kcgs.nn import GaussianField
 
-from .frame import local_gradient, move, widen
-from .settings import Adam, Bounds
+from .adam import FROZEN, begin, bounded, check_gradients, step_field
 
 # steps of place in standard deviations and of log scale, and steps of colours: found on photos, and good on all images
 LEARNING_RATE = 0.14
 COLOR_LEARNING_RATE = 0.03
-# rows of geometry that one task moves, at least, and for which another thread is woken
-_TASK_ROWS = 512
-_THREAD_ROWS = 2048
-# pixels: factors are at least this before they are widened, so that their squares are far from underflow
-_MIN_FACTOR = 0.1
-# age of a row that does not move; loops and programs take every negative one as such
-_FROZEN = -1.0
-# standard deviations by which a centre may lie outside the image
-_MAX_OUTSIDE = 2.0
 
 
 class GaussianAdam(Optimizer):
@@ -118,24 +104,10 @@ class GaussianAdam(Optimizer):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        _check_gradients([parameter.grad for group in self.param_groups for parameter in group["params"]])
+        check_gradients([parameter.grad for group in self.param_groups for parameter in group["params"]])
         for geometry, colors in zip(self.param_groups[::2], self.param_groups[1::2], strict=True):
-            self._step_field(geometry, colors)
+            step_field(self.state, geometry, colors)
         return loss
-
-    def _step_field(self, geometry: dict[str, Any], colors: dict[str, Any]) -> None:
-        """Move the Gaussians of one field."""
-        groups = [group for group in (geometry, colors) if _has_gradient(group)]
-        for group in groups:
-            _begin(self.state[group["params"][0]], group)
-        parameters = geometry["params"] + colors["params"]
-        if takes_triton(*parameters):
-            _launch(self.state, geometry, colors)
-            return
-        finite = None if _raises(parameters[0]) else _finite_rows(parameters)
-        for group in groups:
-            step = _step_geometry if group is geometry else _step_colors
-            step(self.state[group["params"][0]], group, finite)
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """Refuse groups that are no field's: torch calls this when the optimizer is made."""
@@ -158,7 +130,7 @@ class GaussianAdam(Optimizer):
         if _layout(field) != _layout(added):
             raise InvalidArgument("added", _layout(field), _layout(added), verb="have")
         min_sigma = self._group(field)["min_sigma"]
-        means, cholesky = _bounded(added.means, added.cholesky, field.size, min_sigma)
+        means, cholesky = bounded(added.means, added.cholesky, field.size, min_sigma)
         parts = {"means": means, "cholesky": cholesky, "colors": added.colors, "opacities": added.opacities}
         rows = means.ndim - 2
         for name, part in parts.items():
@@ -228,8 +200,8 @@ class GaussianAdam(Optimizer):
         colors = next(group for group in self.param_groups if group["params"][0] is field.colors)
         for group in (geometry, colors):
             state = self.state[group["params"][0]]
-            _begin(state, group)
-            state["age"].masked_fill_(mask[..., None], _FROZEN)
+            begin(state, group)
+            state["age"].masked_fill_(mask[..., None], FROZEN)
 
     def _group(self, field: GaussianField) -> dict[str, Any]:
         """Return the group of a field's geometry; ValueError for a field that the optimizer was not made for."""
@@ -252,14 +224,6 @@ class GaussianAdam(Optimizer):
         return (self.state[tensor] for tensor in (field.means, field.colors) if tensor in self.state)
 
 
-def _select_rows(table: Tensor, index: Tensor, rows: int) -> Tensor:
-    """Return rows of a table, whose dimension they are: (N',) for all images, or (B, N') for each."""
-    if index.ndim == 1:
-        return table.index_select(rows, index)
-    columns = table.shape[2:]
-    return table.gather(1, index.view(*index.shape, *[1] * len(columns)).expand(*index.shape, *columns))
-
-
 def _layout(field: GaussianField) -> str:
     """Say what another field must have to fit to a field."""
     *batch, _, channels = field.colors.shape
@@ -267,182 +231,9 @@ def _layout(field: GaussianField) -> str:
     return " and ".join([f"colors ({', '.join(map(str, [*batch, 'N', channels]))})", *optional])
 
 
-def _step_colors(state: dict[str, Tensor], group: dict[str, Any], finite: Tensor | None) -> None:
-    colors, *opacities = group["params"]
-    # the steps of a frozen table go into a copy of it
-    tables = [table if table.requires_grad else table.clone() for table in (colors, *opacities)]
-    tables = [tables[0], *(alpha[..., None] for alpha in tables[1:])]
-    gradients = [_gradient(colors), *(_gradient(alpha)[..., None] for alpha in opacities)]
-    gradient = torch.cat(gradients, -1) if opacities else gradients[0]
-    if _is_compiled(*tables, *state.values()):
-        from . import loops  # loads numba
-
-        loops.step_tables(tuple(_rows(*tables)), *_rows(gradient), Adam(*_settings(group), *_averages(state)))
-        increment_version([parameter for parameter in group["params"] if parameter.requires_grad])
-        return
-    moving = _moving_rows(state["age"], finite)
-    change = _adam(state, gradient, group, moving)
-    for table, part in zip(tables, change.split([table.shape[-1] for table in tables], -1), strict=True):
-        _write(table, table + part, moving)
-
-
-def _step_geometry(state: dict[str, Tensor], group: dict[str, Any], finite: Tensor | None) -> None:
-    means, cholesky = group["params"]
-    gradients = [_gradient(means), _gradient(cholesky)]
-    if _is_compiled(means, cholesky, *state.values()):
-        from kcgs.compiled.tasks import ranges, run_tasks
-
-        from . import loops  # loads numba
-
-        moves = means.requires_grad, cholesky.requires_grad
-        adam = Adam(*_settings(group), *_averages(state))
-        arrays = _rows(means, cholesky, *gradients)
-        loop = partial(loops.step_geometry, *arrays, moves, adam, _bounds(group))
-        run_tasks(loop, ranges(len(arrays[0]), _TASK_ROWS), 1 + len(arrays[0]) // _THREAD_ROWS)
-        increment_version([parameter for parameter in group["params"] if parameter.requires_grad])
-        return
-    moving = _moving_rows(state["age"], finite)
-    step = _adam(state, local_gradient(cholesky, *gradients), group, moving)
-    step = step.clamp(-group["max_step"], group["max_step"])
-    bounded = _bounded(*move(means, cholesky, step), group["size"], group["min_sigma"])
-    for parameter, values in zip((means, cholesky), bounded, strict=True):
-        if parameter.requires_grad:  # a frozen one is not even brought within bounds
-            _write(parameter, values, moving)
-
-
-def _launch(state: dict[Tensor, Any], geometry: dict[str, Any], colors: dict[str, Any]) -> None:
-    """Take the step of a field on a CUDA device, geometry and colours at once."""
-    from . import cuda  # loads triton
-
-    gradients, adams = [], []
-    for group in (geometry, colors):
-        moves, averages = _has_gradient(group), state[group["params"][0]].values()
-        gradients += [_gradient(p).contiguous() if moves and p.requires_grad else None for p in group["params"]]
-        # where nothing moves any address will do: it is not read
-        adams.append(Adam(*_settings(group), *(averages if moves else group["params"][:1] * 3)))
-    parameters = geometry["params"] + colors["params"]
-    cuda.step(parameters, gradients, adams[0], adams[1], _bounds(geometry))
-    increment_version([p for p, gradient in zip(parameters, gradients, strict=True) if gradient is not None])
-
-
-def _bounds(group: dict[str, Any]) -> Bounds:
-    """Return the bounds of a step of a field's geometry."""
-    limits = group["max_step"], *group["size"], group["min_sigma"], _MIN_FACTOR, _MAX_OUTSIDE
-    return Bounds(*map(float, limits))
-
-
-def _has_gradient(group: dict[str, Any]) -> bool:
-    return any(parameter.grad is not None for parameter in group["params"])
-
-
-def _raises(parameter: Tensor) -> bool:
-    """True where gradients that are not finite are an error: reading values of a device would wait for it."""
-    return parameter.is_cpu
-
-
-def _is_compiled(*tensors: Tensor) -> bool:
-    """True where compiled loops may read and change the memory of tensors."""
-    return not torch.compiler.is_compiling() and all(
-        t.dtype is torch.float32 and t.is_cpu and t.is_contiguous() for t in tensors
-    )
-
-
-def _rows(*tensors: Tensor) -> list[Any]:
-    """Return arrays (N, K) of tensors (..., N, K), in the same memory where that is contiguous."""
-    return [t.detach().contiguous().numpy().reshape(-1, t.shape[-1]) for t in tensors]
-
-
-def _settings(group: dict[str, Any]) -> list[Any]:
-    """Return learning rate, betas and eps as floats; a rate on a device, which a captured graph reads, stays there."""
-    rate = group["lr"]
-    on_device = isinstance(rate, Tensor) and not _raises(rate)
-    return [rate if on_device else float(rate), *map(float, (*group["betas"], group["eps"]))]
-
-
-def _averages(state: dict[str, Tensor]) -> list[Any]:
-    return _rows(state["age"], state["average"], state["square"])
-
-
-def _check_gradients(gradients: list[Tensor | None]) -> None:
-    given = [gradient for gradient in gradients if gradient is not None and _raises(gradient)]
-    if given and _is_compiled(*given) and is_within(given, math.inf):
-        return
-    for gradient in given:
-        if not verify(gradient.isfinite().all(), "gradients must be finite"):
-            count = int((~gradient.isfinite()).sum())
-            cause = "the loss, or an operation between it and the render, is not finite"
-            raise InvalidArgument("gradients", "finite", f"{count} NaN or infinite values: {cause}")
-
-
-def is_within(tables: Sequence[Tensor], limit: float) -> bool:
-    """True where the absolute value of every number of tables is below a limit, and none is NaN."""
-    if not tables[0].is_cpu:
-        return bool(torch.stack([(table.detach().abs() < limit).all() for table in tables]).all())
-    # compiled: between renders, whose data fill the caches, an operation of torch takes thirty microseconds
-    from . import loops  # loads numba
-
-    return bool(loops.is_within(tuple(table.detach().numpy().ravel() for table in tables), limit))
-
-
-def _gradient(parameter: Tensor) -> Tensor:
-    return torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
-
-
-def _begin(state: dict[str, Tensor], group: dict[str, Any]) -> None:
-    """Make the averages of a group (..., N, K), if there are none; each row has an age of its own."""
-    if not state:
-        first, *others = group["params"]
-        columns = 5 if group["kind"] == "geometry" else first.shape[-1] + len(others)
-        for name, width in {"age": 1, "average": columns, "square": columns}.items():
-            state[name] = first.new_zeros(*first.shape[:-1], width)
-
-
-def _adam(state: dict[str, Tensor], gradient: Tensor, group: dict[str, Any], moving: Tensor | None) -> Tensor:
-    """Update the averages of a table (..., N, K), in rows that move, and return Adam's step."""
-    beta1, beta2 = group["betas"]
-    previous = [] if moving is None else [values.clone() for values in state.values()]
-    age, average, square = state["age"], state["average"], state["square"]
-    age += 1
-    average.lerp_(gradient, 1 - beta1)
-    square.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
-    scale = (square / (1 - beta2**age)).sqrt_().add_(group["eps"])
-    step: Tensor = average / (1 - beta1**age) / scale * -group["lr"]
-    if moving is not None:
-        for values, old in zip(state.values(), previous, strict=True):
-            values.copy_(torch.where(moving, values, old))
-    return step
-
-
-def _finite_rows(parameters: list[Tensor]) -> Tensor:
-    """Return a mask of the Gaussians whose gradients are finite, (..., N, 1)."""
-    means, *others = (_gradient(parameter) for parameter in parameters)
-    tables = [means, *(table if table.ndim == means.ndim else table[..., None] for table in others)]
-    return torch.cat(tables, -1).isfinite().all(-1, keepdim=True)
-
-
-def _moving_rows(age: Tensor, finite: Tensor | None) -> Tensor | None:
-    """Return a mask of the Gaussians that move, (..., N, 1): of finite gradients, and not frozen; None: all do."""
-    if finite is not None:
-        return finite & (age >= 0)
-    return age >= 0 if bool((age < 0).any()) else None
-
-
-def _write(table: Tensor, values: Tensor, moving: Tensor | None) -> None:
-    """Put values into a table, (..., N, K); with a mask, in rows that move, where the values are finite."""
-    table.copy_(values if moving is None else torch.where(moving & values.isfinite(), values, table))
-
-
-def _bounded(means: Tensor, cholesky: Tensor, size: tuple[int, int], min_sigma: float) -> tuple[Tensor, Tensor]:
-    """Move centres back to about the image, and make Gaussians neither too thin nor larger than the image."""
-    height, width = size
-    diagonal = math.hypot(height, width)
-    l11, l21, l22 = cholesky.unbind(-1)
-    l11, l22 = l11.clamp(_MIN_FACTOR, diagonal), l22.clamp(_MIN_FACTOR, diagonal)
-    l21 = l21.clamp(-diagonal, diagonal)
-    # no tensor of the size: its copy to a device would force a host sync
-    reaches, lengths = (_MAX_OUTSIDE * l11, _MAX_OUTSIDE * torch.hypot(l21, l22)), (width, height)
-    places = [
-        torch.minimum(torch.maximum(place, -reach), reach + length)
-        for place, reach, length in zip(means.unbind(-1), reaches, lengths, strict=True)
-    ]
-    return torch.stack(places, -1), widen(torch.stack([l11, l21, l22], -1), min_sigma)
+def _select_rows(table: Tensor, index: Tensor, rows: int) -> Tensor:
+    """Return rows of a table, whose dimension they are: (N',) for all images, or (B, N') for each."""
+    if index.ndim == 1:
+        return table.index_select(rows, index)
+    columns = table.shape[2:]
+    return table.gather(1, index.view(*index.shape, *[1] * len(columns)).expand(*index.shape, *columns))

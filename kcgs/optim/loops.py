@@ -1,4 +1,4 @@
-"""The steps of `gaussian_adam.py` in compiled loops: tables of float32 on the CPU, numbers in between in float64.
+"""The steps of `adam.py` in compiled loops: tables of float32 on the CPU, numbers in between in float64.
 
 With torch operations a fit takes 16 to 20 % longer.
 """

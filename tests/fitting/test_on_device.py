@@ -25,7 +25,7 @@ from kcgs.fitting.steppers.graph import StepGraph
 from kcgs.fitting.steppers.readback import Readback
 from kcgs.functional import PairSoftness, contour_fit
 from kcgs.kernels.cuda.capacity import reports
-from kcgs.optim import gaussian_adam
+from kcgs.optim import adam
 from kcgs.optim.gaussians import Gaussians, Renderer
 
 from .absent_device import AbsentDevice, DeviceTensor
@@ -54,8 +54,8 @@ def same(a: FitResult, b: FitResult) -> bool:
 @pytest.fixture
 def adam_of_a_device(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     """Take GaussianAdam's form for devices: it leaves out gradients of NaN."""
-    monkeypatch.setattr(gaussian_adam, "_raises", lambda parameter: False)
-    monkeypatch.setattr(gaussian_adam, "_is_compiled", lambda *tensors: False)
+    monkeypatch.setattr(adam, "_raises", lambda parameter: False)
+    monkeypatch.setattr(adam, "_is_compiled", lambda *tensors: False)
     return monkeypatch
 
 
@@ -252,8 +252,8 @@ def test_a_step_reads_no_value_and_takes_few_operations(adam_of_a_device: pytest
     counter, steppers = Counter(), []
     for owner, name in ((Renderer, "squared_error_gradients"), (Renderer, "render"), (torch.autograd, "grad")):
         adam_of_a_device.setattr(owner, name, counter.paused(getattr(owner, name), name))
-    adam_of_a_device.setattr(gaussian_adam, "takes_triton", lambda *tensors: True)
-    adam_of_a_device.setattr(gaussian_adam, "_launch", lambda *arguments: counter.operations.append("_launch"))
+    adam_of_a_device.setattr(adam, "takes_triton", lambda *tensors: True)
+    adam_of_a_device.setattr(adam, "_launch", lambda *arguments: counter.operations.append("_launch"))
     for name in READS:
         adam_of_a_device.setattr(Tensor, name, counter.reading(getattr(Tensor, name)))
 

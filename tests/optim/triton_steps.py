@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kcgs import GaussianField
-from kcgs.optim import GaussianAdam, gaussian_adam
+from kcgs.optim import GaussianAdam, adam
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 SIZE = (24, 36)
@@ -19,17 +19,17 @@ SIZE = (24, 36)
 @pytest.fixture(autouse=True)
 def launches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Take the steps of float32 tables by the kernel, and none of a gradient that is not finite; count launches."""
-    counts, launch = [], gaussian_adam._launch
+    counts, launch = [], adam._launch
 
     def counted_launch(*arguments: object) -> None:
         counts.append(1)
         launch(*arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(gaussian_adam, "_launch", counted_launch)
-    monkeypatch.setattr(gaussian_adam, "_raises", lambda parameter: False)
+    monkeypatch.setattr(adam, "_launch", counted_launch)
+    monkeypatch.setattr(adam, "_raises", lambda parameter: False)
     if DEVICE.type == "cpu":
         takes_triton = lambda *tensors: all(t.dtype is torch.float32 for t in tensors)  # noqa: E731
-        monkeypatch.setattr(gaussian_adam, "takes_triton", takes_triton)
+        monkeypatch.setattr(adam, "takes_triton", takes_triton)
     return counts
 
 
