@@ -117,15 +117,17 @@ class _Proposals(NamedTuple):
 
 
 @torch.no_grad()
-def propose(residual: Tensor, regions: RegionMap | None, count: int, *, backend: str = "auto") -> GaussianField:
-    """Do what `propose_gaussians` does, with arguments that are checked; `count` may be 0."""
+def propose(
+    residual: Tensor, regions: RegionMap | None, count: int | Tensor, *, backend: str = "auto"
+) -> GaussianField:
+    """Do what `propose_gaussians` does, with arguments that are checked; `count` may be 0, or of each image, (B,)."""
     residual = residual.detach()
     is_batch, size = residual.ndim == 4, (residual.shape[-2], residual.shape[-1])
     residual = residual if is_batch else residual[None]
     # below this the gain is rounding error: one pixel's, at the precision of the largest
     largest = residual.abs().amax((1, 2, 3)).double()
     floor = (128 * torch.finfo(residual.dtype).eps * largest).square()
-    missing = torch.full_like(floor, count, dtype=torch.int64)
+    missing = torch.zeros_like(floor, dtype=torch.int64) + count
     batch = len(residual)
     rounds = [_Proposals(missing[:0], *(residual.new_zeros(0, columns) for columns in (2, 3, residual.shape[1])))]
     while bool((missing > 0).any()):
@@ -157,7 +159,7 @@ def _products(first: Tensor, second: Tensor) -> Tensor:
     return torch.stack([a.dot(b) for a, b in pairs]) if first.is_cpu else (first * second).sum((1, 2, 3))
 
 
-def propose_for(objective: Objective, rendered: Tensor, renderer: Renderer, count: int) -> GaussianField:
+def propose_for(objective: Objective, rendered: Tensor, renderer: Renderer, count: int | Tensor) -> GaussianField:
     """Find at most `count` Gaussians that lower an objective of each render, (..., C, H, W), most: see `propose`."""
     error, root = objective.residual(rendered)
     added = propose(error, renderer.regions, count, backend=renderer.backend)
@@ -171,15 +173,27 @@ def propose_for(objective: Objective, rendered: Tensor, renderer: Renderer, coun
 def add_gaussians(state: FitState, count: int) -> None:
     """Add at most so many Gaussians to each image of a fit, if any, that lower its objective most.
 
-    An image with use for fewer than others gets rows of the colour 0, which stay as they are.
+    In a batch an image gets Gaussians in place of its frozen rows, too. One with use for fewer than others gets rows of
+    the colour 0, which are frozen.
     """
-    if count > 0:
-        before, rendered = state.num_gaussians, state.render().detach()
-        added = propose_for(state.objective, rendered, state.renderer, count)
-        unused = (added.colors.detach() == 0).all(-1)
-        state.optimizer.append(state.field, added)
-        if bool(unused.any()):
-            state.optimizer.freeze(state.field, pad(unused, (before, 0)))
+    if count <= 0:
+        return
+    field, optimizer, is_batch = state.field, state.optimizer, state.problem.num_images > 1
+    is_used = ~optimizer.frozen_rows(field) if is_batch else None
+    missing = count if is_used is None else count + (~is_used).sum(1)
+    added = propose_for(state.objective, state.render().detach(), state.renderer, missing)
+    optimizer.append(field, added)
+    if is_used is None:
+        return
+    is_used = torch.cat([is_used, (added.colors.detach() != 0).any(-1)], 1)
+    num_used = is_used.sum(1, keepdim=True)
+    # as many rows of each image, of the frozen ones the first
+    is_kept = is_used | ((~is_used).cumsum(1) <= num_used.max() - num_used)
+    if not bool(is_kept.all()):
+        optimizer.keep(field, is_kept)
+    is_frozen = ~is_used[is_kept].view(len(is_used), -1)
+    if bool(is_frozen.any()):
+        optimizer.freeze(field, is_frozen)
 
 
 def _strongest(residual: Tensor, regions: RegionMap | None, floor: Tensor, missing: Tensor) -> _Proposals:

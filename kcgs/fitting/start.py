@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from kcgs.functional import RegionMap, choose_softness
 from kcgs.maps import pairs_to_merge
-from kcgs.nn import GaussianField
+from kcgs.nn import GaussianField, pad_rows
 from kcgs.optim import Renderer, draft_cutoff
 
 from .batch_maps import join_maps, map_of_each, regions_per_map
@@ -24,11 +25,29 @@ _INITIALIZERS = {"uniform": uniform_field, "random": random_field, "gradient": g
 
 def start(problem: Problem) -> FitState:
     """Return the state of a fit at its start."""
-    config, regions = problem.config, _regions_to_render(problem)
-    share = math.ceil(config.densify_from * problem.num_gaussians)
-    count = min(problem.num_gaussians, max(1 if regions is None else max(regions_per_map(regions)), share))
-    field = _INITIALIZERS[config.initializer](problem.canvas, count, regions, problem.seed)
-    return make_state(problem, field, regions, count, anchor=regions)
+    regions, first = _regions_to_render(problem), math.ceil(problem.config.densify_from * problem.num_gaussians)
+    # a Gaussian for each region of an image, as far as there may be
+    num_regions = [1] * problem.num_images if regions is None else regions_per_map(regions)
+    counts = [min(problem.num_gaussians, max(first, count)) for count in num_regions]
+    field = _initial_field(problem, regions, counts)
+    state = make_state(problem, field, regions, field.num_gaussians, anchor=regions)
+    if min(counts) < field.num_gaussians:
+        rows, numbers = torch.arange(field.num_gaussians), torch.tensor(counts)[:, None]
+        state.optimizer.freeze(field, (rows >= numbers).to(problem.device))
+    return state
+
+
+def _initial_field(problem: Problem, regions: RegionMap | None, counts: list[int]) -> GaussianField:
+    """Return so many Gaussians for each image; images with fewer than others have rows of the colour 0 at the end."""
+    initialize, images, most = _INITIALIZERS[problem.config.initializer], problem.canvas, max(counts)
+    if regions is None or min(counts) == most:
+        return initialize(images, most, regions, problem.seed)
+    maps = map_of_each(regions, problem.num_images)
+    fields = [
+        pad_rows(initialize(image[None], count, one, problem.seed)[0], most, one)
+        for image, count, one in zip(images, counts, maps, strict=True)
+    ]
+    return GaussianField.stack(fields)
 
 
 def make_state(

@@ -203,6 +203,11 @@ class GaussianAdam(Optimizer):
             begin(state, group)
             state["age"].masked_fill_(mask[..., None], FROZEN)
 
+    def frozen_rows(self, field: GaussianField) -> Tensor:
+        """Return the mask of the Gaussians that `freeze` has frozen, boolean, :math:`(N)` or :math:`(B, N)`."""
+        age = self.state[field.means].get("age")
+        return torch.zeros_like(field.means[..., 0], dtype=torch.bool) if age is None else age[..., 0] < 0
+
     def _group(self, field: GaussianField) -> dict[str, Any]:
         """Return the group of a field's geometry; ValueError for a field that the optimizer was not made for."""
         for group in self.param_groups:

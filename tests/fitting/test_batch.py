@@ -161,8 +161,10 @@ def test_maps_of_several_numbers_of_regions() -> None:
         result = fit(photos(), labels, 20, iterations=80)
     counts = [len(scene.regions.labels.unique()) for scene in result.scene]
     assert counts == [2, 2, 1, 20] and [report.num_after for report in result.regions] == counts
-    for scene in result.scene:
+    for k, scene in enumerate(result.scene):
         assert torch.isin(scene.field.region_ids, scene.regions.ids).all()
+        # the image of many regions has all its Gaussians from the start, the others get theirs later
+        assert k == 3 or float(result.psnr[k]) > fit(photos()[k], labels[k], 20, iterations=80).psnr - 0.5
     torch.testing.assert_close(psnr(result.scene.render(), photos()), result.psnr.float(), rtol=1e-3, atol=0)
 
 

@@ -94,6 +94,11 @@ class PublishedOptimizer(ABC):
         self.frozen = mask[..., None] if self.frozen is None else self.frozen | mask[..., None]
         self._set(self.encode(field))
 
+    def frozen_rows(self, field: GaussianField) -> Tensor:
+        """Return the mask of the Gaussians that `freeze` has frozen, (..., N)."""
+        none = torch.zeros_like(field.means[..., 0], dtype=torch.bool)
+        return none if self.frozen is None else self.frozen[..., 0]
+
     def state_dict(self) -> dict[str, Any]:
         """Return parameters and averages."""
         return {"parameters": [p.detach() for p in self.parameters], "optimizer": self.optimizer.state_dict()}
