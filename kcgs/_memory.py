@@ -28,7 +28,10 @@ def check_batch_memory(name: str, images: Tensor, per_image: float) -> None:
     count, needed = len(images), len(images) * per_image
     if needed <= _SMALL:
         return
-    free = float(torch.cuda.mem_get_info(images.device)[0]) if images.is_cuda else free_memory()
+    free = free_memory()
+    if images.is_cuda:  # what torch keeps for later is free, too
+        kept = torch.cuda.memory_reserved(images.device) - torch.cuda.memory_allocated(images.device)
+        free = float(torch.cuda.mem_get_info(images.device)[0] + kept)
     if needed > free:
         memory = f"{needed / 1e9:,.1f} GB of memory; {free / 1e9:,.1f} GB are free"
         raise ValueError(f"{name} has {count} images, which need about {memory}: at most {int(free / per_image)} fit")

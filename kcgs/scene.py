@@ -206,7 +206,7 @@ def empty_regions(scene: Scene) -> Tensor:
     regions, ids = scene.regions, scene.field.region_ids
     if regions is None or ids is None or ids.is_meta:
         return torch.empty(0, dtype=torch.int64)
-    return regions.ids[~torch.isin(regions.ids, ids)]
+    return regions.ids[~torch.isin(regions.ids, ids[(scene.field.merged_colors() != 0).any(-1)])]
 
 
 def check_type(scene: object, name: str = "scene") -> Scene:

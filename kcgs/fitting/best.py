@@ -21,7 +21,7 @@ class Best(NamedTuple):
     field: GaussianField
     """A batch of copies; rows that a scene lacks have the colour 0."""
     maps: list[RegionMap | None]
-    """Of each image the map that it was rendered with: its own, or that of the batch at the time."""
+    """Of each image the map that it was rendered with, or the batch of maps that has it at the image's place."""
     is_draft: Tensor
     """Rendered with the cutoff of a draft: any scene that is none beats it; bool, (B,)."""
     value: Tensor
@@ -36,8 +36,9 @@ class Best(NamedTuple):
 
     def improved_by(self, other: Best) -> Best:
         """Return for each image the better one: the other only where it has a lower value, or is the first final."""
-        is_later = self.is_draft & ~other.is_draft
-        wins = (is_later | ((other.value < self.value) & (self.is_draft == other.is_draft))) & ~other.value.isnan()
+        is_first_final = self.is_draft & ~other.is_draft
+        is_lower = (other.value < self.value) & (self.is_draft == other.is_draft)
+        wins = (is_first_final | is_lower) & ~other.value.isnan()
         if bool(wins.all()):
             return other
         if not bool(wins.any()):

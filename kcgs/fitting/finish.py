@@ -34,6 +34,7 @@ def finish(state: FitState, reason: str, clock: Clock) -> FitResult:
     return FitResult(
         pruned.scene, state.history, reason, config, pruned.num_pruned, pruned.prune_error,
         _report_regions(problem, pruned.scene), clock.seconds(), psnr if problem.is_batch else float(psnr),
+        tuple(state.diverged),
     )  # fmt: skip
 
 
@@ -51,15 +52,14 @@ def _report_regions(problem: Problem, scene: Scene) -> RegionReport | list[Regio
 @torch.no_grad()
 def _measure_last(state: FitState, seconds: float) -> None:
     """Measure the best with the cutoff of the result, and the last scene of images that did not diverge."""
-    problem, drafts = state.problem, state.best
-    if state.is_draft:
-        state.end_drafts()
-        if drafts is not None:
-            scene = drafts.scene
-            renderer = state.renderer._replace(regions=scene.regions)
-            errors = measure_errors(problem, renderer.render(Gaussians.of(scene.field)))
-            record(state, Measurement(state.iteration, seconds, scene, is_draft=False, excluded=[]), errors)
-    state.exclude(state.diverging())
-    if not state.has_diverged:
+    problem = state.problem
+    state.end_drafts()
+    if state.best is not None and bool(state.best.is_draft.any()):
+        scene = state.best.scene
+        renderer = state.renderer._replace(regions=scene.regions)
+        errors = measure_errors(problem, renderer.render(Gaussians.of(scene.field)))
+        record(state, Measurement(state.iteration, seconds, scene, is_draft=False, excluded=[]), errors)
+    state.exclude(state.overflowing_images())
+    if not state.all_diverged:
         remove_gaussians(state, state.num_gaussians - problem.num_gaussians)
         record(state, snapshot(state, seconds), measure_errors(problem, state.render()))

@@ -63,10 +63,10 @@ def fit(
     scene holds fewer than N Gaussians where the recipe prunes, or its target takes fewer. With `target_psnr` several
     fits search for the fewest Gaussians that reach it; `on_step` counts the iterations of each.
 
-    A batch has as many rows for each image; one that an image has no use for has the colour 0. On a CPU and without a
-    map, an image gets the scene that it gets alone with the same seed, bit for bit. With maps of different numbers of
-    regions the numbers of Gaussians grow alike, so that scenes differ a little. An image whose numbers overflow keeps
-    its best scene, with a UserWarning, and the others go on. The history has means over the images.
+    All images of a batch have the same number of rows; one that an image has no use for has the colour 0. On a CPU an
+    image gets the scene that it gets alone with the same seed, bit for bit, unless the clock stops the fit, there are
+    hardly more Gaussians than regions, or it has no use for all of them. An image whose numbers overflow keeps its best
+    scene, with a UserWarning, and the others go on. The history has means over the images.
 
     The history's `loss` is the value of the objective. With a loss of your own, such as one of Kornia's, the scene of
     the lowest is returned. Gaussians are added where the render differs from the image, and contours move to it;

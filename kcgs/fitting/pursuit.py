@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -170,21 +170,28 @@ def propose_for(objective: Objective, rendered: Tensor, renderer: Renderer, coun
     return added
 
 
-def add_gaussians(state: FitState, count: int) -> None:
+def add_gaussians(state: FitState, count: int, fewer: Sequence[int] = ()) -> None:
     """Add at most so many Gaussians to each image of a fit, if any, that lower its objective most.
 
     In a batch an image gets Gaussians in place of its frozen rows, too. One with use for fewer than others gets rows of
     the colour 0, which are frozen.
+
+    Args:
+        state: of the fit.
+        count: by which the number of rows may grow.
+        fewer: of each image, by how many less than others it gets; () where all get as many.
     """
     if count <= 0:
         return
-    field, optimizer, is_batch = state.field, state.optimizer, state.problem.num_images > 1
-    is_used = ~optimizer.frozen_rows(field) if is_batch else None
-    missing = count if is_used is None else count + (~is_used).sum(1)
+    field, optimizer = state.field, state.optimizer
+    if state.problem.num_images == 1:
+        optimizer.append(field, propose_for(state.objective, state.render().detach(), state.renderer, count))
+        return
+    is_used = ~optimizer.frozen_rows(field)
+    missing = count + (~is_used).sum(1) - torch.tensor(fewer or [0], device=is_used.device)
+    missing.index_fill_(0, torch.tensor(state.diverged, dtype=torch.int64, device=is_used.device), 0)
     added = propose_for(state.objective, state.render().detach(), state.renderer, missing)
     optimizer.append(field, added)
-    if is_used is None:
-        return
     is_used = torch.cat([is_used, (added.colors.detach() != 0).any(-1)], 1)
     num_used = is_used.sum(1, keepdim=True)
     # as many rows of each image, of the frozen ones the first
@@ -300,7 +307,7 @@ def _evaluate(planes: Tensor, labels: Tensor | None, sigma: float) -> tuple[Tens
         from .pursuit_loops import evaluate  # loads numba
 
         return evaluate(*arguments)
-    from .cuda import blur  # loads triton
+    from .pursuit_cuda import blur  # loads triton
 
     blurred = blur(*arguments)
     colors = blurred[:, :-1] / blurred[:, -1:]

@@ -25,9 +25,9 @@ def lowest_impact(
 
     Convention: the impact of Gaussian i is :math:`|c_i|^2 \langle g_i, g_i \rangle / (1 + \sum_j o_{ij})`. The overlap
     :math:`o_{ij}` is the normalised inner product of two Gaussians of half the covariances: 1 for twins, and near 0 for
-    distant ones. Only the half of the Gaussians with more energy count as j, for others may be removed as well. The
-    other colours take one gradient step towards the render of what is removed, scaled by each one's energy and
-    overlaps, and of the best length.
+    distant ones. Of the Gaussians that are not black only the half with more energy count as j, for others may be
+    removed as well. The other colours take one gradient step towards the render of what is removed, scaled by each
+    one's energy and overlaps, and of the best length.
 
     Args:
         field: N Gaussians of an image, or of each image of a batch, without opacities.
@@ -75,7 +75,8 @@ def lowest_weighted_impact(
 
     area = math.pi * cholesky[..., :1] * cholesky[..., 2:]
     energy = weight * colors.square().sum(-1) * area[..., 0]
-    is_strong = ~_lowest(energy, energy.shape[-1] // 2)
+    num_unused = (colors == 0).all(-1).sum(-1, keepdim=True)
+    is_strong = ~_lowest(energy, num_unused + (energy.shape[-1] - num_unused) // 2)
     norm, factors = (0.5 * area).rsqrt(), is_strong[..., None].to(colors)
     overlaps = norm * products(cholesky / math.sqrt(2.0), norm * factors)
     crowding = 1.0 + (overlaps - factors).clamp_min(0.0)
@@ -88,9 +89,10 @@ def lowest_weighted_impact(
     return removed, colors + length * step
 
 
-def _lowest(values: Tensor, count: int) -> Tensor:
-    """Mark the lowest values of each image, so many; of equal ones the first."""
-    return torch.zeros_like(values, dtype=torch.bool).scatter_(-1, values.argsort(stable=True)[..., :count], True)
+def _lowest(values: Tensor, count: int | Tensor) -> Tensor:
+    """Mark the lowest values of each image, so many, or (..., 1) of each; of equal ones the first."""
+    order, places = values.argsort(stable=True), torch.arange(values.shape[-1], device=values.device)
+    return torch.zeros_like(values, dtype=torch.bool).scatter_(-1, order, (places < count).expand_as(order))
 
 
 @torch.no_grad()

@@ -58,6 +58,9 @@ class FitResult(NamedTuple):
     psnr: float | Tensor = math.nan
     """Of the scene before pruning, in dB; of a batch (B,), on the CPU; NaN without an image."""
 
+    diverged: tuple[int, ...] = ()
+    """Images whose numbers overflowed; their scenes are the best of before."""
+
     def __repr__(self) -> str:
         psnr = float(torch.as_tensor(self.psnr).mean())
         return f"FitResult({psnr:.2f} dB, stopped by {self.stop_reason}, {self.seconds:.1f} s, {self.scene!r})"

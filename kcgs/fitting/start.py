@@ -32,6 +32,7 @@ def start(problem: Problem) -> FitState:
     field = _initial_field(problem, regions, counts)
     state = make_state(problem, field, regions, field.num_gaussians, anchor=regions)
     if min(counts) < field.num_gaussians:
+        state.initial_counts = counts
         rows, numbers = torch.arange(field.num_gaussians), torch.tensor(counts)[:, None]
         state.optimizer.freeze(field, (rows >= numbers).to(problem.device))
     return state

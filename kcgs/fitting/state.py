@@ -8,8 +8,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap
+from kcgs.kernels import MEAN_LIMIT
 from kcgs.optim import FieldState, is_within
 from kcgs.scene import Scene
 
@@ -17,8 +19,8 @@ from .best import Best
 from .problem import Problem
 from .result import HistoryEntry
 
-# numbers beyond it are near overflow
-LARGEST = 1e15
+# numbers beyond it have diverged: the renderer takes no such centre
+LARGEST = MEAN_LIMIT
 
 
 @dataclass(kw_only=True, repr=False)
@@ -29,7 +31,9 @@ class FitState(FieldState):
     anchor: RegionMap | None
     """The map that contours may not move far from."""
     num_initial: int
-    """Gaussians of each image at the start."""
+    """Rows at the start."""
+    initial_counts: list[int] = field(default_factory=list)
+    """Gaussians of each image at the start, where they differ from it."""
     num_requested: int
     """Gaussians of each image that the schedule last asked for; fewer exist where fewer were of use."""
     num_additions: int = 0
@@ -62,13 +66,12 @@ class FitState(FieldState):
         """True where the cutoff is not yet that of the result."""
         return self.renderer.cutoff != self.problem.config.cutoff
 
-    def diverging(self) -> list[int]:
-        """Return the images of which a number is not finite, or near overflow, and that do not count as diverged."""
+    def overflowing_images(self) -> list[int]:
+        """Return the images of which a number is not finite, or too large."""
         tables = [self.field.means, self.field.cholesky, self.field.colors]
         if is_within(tables, LARGEST):
             return []
-        images = (image for image in range(len(tables[0])) if image not in self.diverged)
-        return [image for image in images if not is_within([table[image] for table in tables], LARGEST)]
+        return [image for image in range(len(tables[0])) if not is_within([table[image] for table in tables], LARGEST)]
 
     @property
     def expected_iterations(self) -> float:
@@ -79,15 +82,22 @@ class FitState(FieldState):
         return self.iteration / max(self.progress, 1e-9)
 
     @property
-    def has_diverged(self) -> bool:
+    def all_diverged(self) -> bool:
         """True where no image is left."""
         return len(self.diverged) == self.problem.num_images
 
     @torch.no_grad()
     def exclude(self, images: list[int]) -> None:
-        """Count images as diverged: from here on their Gaussians have the colour 0, unless no other image is left."""
-        self.diverged += images
-        if not images or self.has_diverged:
+        """Give images that overflow Gaussians of the colour 0, which stay, unless no other image is left.
+
+        They count as diverged from here on; a warning says so.
+        """
+        if new := [image for image in images if image not in self.diverged]:
+            self.diverged += new
+            numbers = f"image{'s' * (len(new) > 1)} {', '.join(map(str, new))} of the batch"
+            which = "the fit" if self.problem.num_images == 1 else numbers
+            warn_user(f"{which} diverged at iteration {self.iteration}: the best so far is kept")
+        if not images or self.all_diverged:
             return
         field = self.field
         for table, fill in ((field.means, 1.0), (field.cholesky, 1.0), (field.colors, 0.0)):

@@ -29,7 +29,7 @@ FROZEN = -1.0
 _MAX_OUTSIDE = 2.0
 
 
-def step_field(state: dict[Tensor, Any], geometry: dict[str, Any], colors: dict[str, Any]) -> None:
+def step_groups(state: dict[Tensor, Any], geometry: dict[str, Any], colors: dict[str, Any]) -> None:
     """Move the Gaussians of one field by the state of the optimizer and the field's two groups."""
     groups = [group for group in (geometry, colors) if _has_gradient(group)]
     for group in groups:
@@ -38,7 +38,7 @@ def step_field(state: dict[Tensor, Any], geometry: dict[str, Any], colors: dict[
     if takes_triton(*parameters):
         _launch(state, geometry, colors)
         return
-    finite = None if _raises(parameters[0]) else _finite_rows(parameters)
+    finite = None if _checks_gradients(parameters[0]) else _finite_rows(parameters)
     for group in groups:
         step = _step_geometry if group is geometry else _step_colors
         step(state[group["params"][0]], group, finite)
@@ -112,7 +112,7 @@ def _has_gradient(group: dict[str, Any]) -> bool:
     return any(parameter.grad is not None for parameter in group["params"])
 
 
-def _raises(parameter: Tensor) -> bool:
+def _checks_gradients(parameter: Tensor) -> bool:
     """True where gradients that are not finite are an error: reading values of a device would wait for it."""
     return parameter.is_cpu
 
@@ -132,7 +132,7 @@ def _rows(*tensors: Tensor) -> list[Any]:
 def _settings(group: dict[str, Any]) -> list[Any]:
     """Return learning rate, betas and eps as floats; a rate on a device, which a captured graph reads, stays there."""
     rate = group["lr"]
-    on_device = isinstance(rate, Tensor) and not _raises(rate)
+    on_device = isinstance(rate, Tensor) and not _checks_gradients(rate)
     return [rate if on_device else float(rate), *map(float, (*group["betas"], group["eps"]))]
 
 
@@ -142,7 +142,7 @@ def _averages(state: dict[str, Tensor]) -> list[Any]:
 
 def check_gradients(gradients: list[Tensor | None]) -> None:
     """Raise a ValueError for gradients on the CPU that are not finite."""
-    given = [gradient for gradient in gradients if gradient is not None and _raises(gradient)]
+    given = [gradient for gradient in gradients if gradient is not None and _checks_gradients(gradient)]
     if given and _is_compiled(*given) and is_within(given, math.inf):
         return
     for gradient in given:

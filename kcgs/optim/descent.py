@@ -20,7 +20,8 @@ class FieldState:
 
     field: GaussianField
     optimizer: Any
-    """A GaussianAdam, or what has its `param_groups`, `step`, `append`, `keep`, `state_dict` and `load_state_dict`."""
+    """A GaussianAdam, or what has its `param_groups`, `step`, `append`, `keep`, `state_dict` and `load_state_dict`, and
+    for a batch `freeze` and `frozen_rows`."""
     objective: Objective
     renderer: Renderer
     iteration: int = 0

@@ -14,7 +14,7 @@ from kcgs._check import check_number
 from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.nn import GaussianField
 
-from .adam import FROZEN, begin, bounded, check_gradients, step_field
+from .adam import FROZEN, begin, bounded, check_gradients, step_groups
 
 # steps of place in standard deviations and of log scale, and steps of colours: found on photos, and good on all images
 LEARNING_RATE = 0.14
@@ -106,7 +106,7 @@ class GaussianAdam(Optimizer):
                 loss = closure()
         check_gradients([parameter.grad for group in self.param_groups for parameter in group["params"]])
         for geometry, colors in zip(self.param_groups[::2], self.param_groups[1::2], strict=True):
-            step_field(self.state, geometry, colors)
+            step_groups(self.state, geometry, colors)
         return loss
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:

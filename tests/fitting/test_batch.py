@@ -87,7 +87,7 @@ def test_rows_without_use_have_the_colour_0_and_stay() -> None:
 
 
 class Faulty(GaussianAdam):
-    """Breaks one image at the 31st step."""
+    """Breaks an image at the 31st step, and twice more later."""
 
     image = 1
     num_steps = 0
@@ -95,7 +95,7 @@ class Faulty(GaussianAdam):
     def step(self, closure: Any = None) -> Any:
         super().step(closure)
         self.num_steps += 1
-        if self.num_steps == 31:
+        if self.num_steps in (31, 60, 100):
             with torch.no_grad():
                 self.param_groups[0]["params"][0][self.image] = torch.nan
 
@@ -103,9 +103,9 @@ class Faulty(GaussianAdam):
 def test_an_image_that_diverges_keeps_its_best_and_the_others_go_on() -> None:
     settings: dict[str, Any] = {"num_gaussians": 30, "iterations": 100, "prune": 0.0}
     expected = fit(photos(), **settings)
-    with pytest.warns(UserWarning, match="images 1 diverged at iteration 31: the best so far of each is kept"):
+    with pytest.warns(UserWarning, match="image 1 of the batch diverged at iteration 31: the best so far is kept"):
         result = fit(photos(), optimizer=Faulty, **settings)
-    assert result.stop_reason == "iterations"
+    assert result.stop_reason == "iterations" and result.diverged == (1,)
     for k in (0, 2, 3):
         for actual, values in zip(
             rows_in_use(result.scene[k].field), rows_in_use(expected.scene[k].field), strict=True
@@ -115,6 +115,15 @@ def test_an_image_that_diverges_keeps_its_best_and_the_others_go_on() -> None:
     torch.testing.assert_close(psnr(rendered, photos()), result.psnr.float(), rtol=1e-4, atol=1e-3)
     assert 8 < result.psnr[1] < expected.psnr[1]
     assert all(entry.psnr == entry.psnr for entry in result.history)
+
+
+def test_divergence_at_the_last_step_is_told() -> None:
+    with pytest.warns(UserWarning, match="the fit diverged at iteration 31"):
+        assert fit(photos()[0], None, 30, iterations=31, optimizer=lambda field: Late(field)).diverged == (0,)
+
+
+class Late(Faulty):
+    image = 0
 
 
 def test_a_batch_of_which_no_image_is_left_ends() -> None:
@@ -129,11 +138,12 @@ def halves(edges: list[int], ids: tuple[int, int] = (3, 7)) -> Tensor:
 
 
 @pytest.mark.parametrize("settings", [{}, {"softness": 0.0}, {"softness": 0.8}, {"recipe": "paper"}])
-def test_maps_of_as_many_regions_give_each_image_what_it_gets_alone(settings: dict[str, Any]) -> None:
-    """Contours move and get their widths, image by image."""
+def test_with_maps_each_image_gets_what_it_gets_alone(settings: dict[str, Any]) -> None:
+    """Contours move and get their widths, image by image; the number of Gaussians grows by the number of regions."""
     images, labels = photos(), halves([20, 28, 36, 30])
+    labels[1:, 20:, :20], labels[2, :10, :10], labels[2, 30:, 45:] = 9, 1, 4
     images[:, :, :, :20] *= 0.3
-    arguments: dict[str, Any] = {"num_gaussians": 30, "iterations": 120, **settings}
+    arguments: dict[str, Any] = {"num_gaussians": 60, "iterations": 120, **settings}
     result = fit(images, labels, **arguments)
     assert result.scene.regions is not None and result.regions is not None
     for k, image in enumerate(images):
@@ -166,6 +176,15 @@ def test_maps_of_several_numbers_of_regions() -> None:
         # the image of many regions has all its Gaussians from the start, the others get theirs later
         assert k == 3 or float(result.psnr[k]) > fit(photos()[k], labels[k], 20, iterations=80).psnr - 0.5
     torch.testing.assert_close(psnr(result.scene.render(), photos()), result.psnr.float(), rtol=1e-3, atol=0)
+
+
+def test_a_region_whose_gaussians_were_pruned_is_reported_as_black() -> None:
+    """As alone, where its Gaussians are gone."""
+    images, labels = photos(), halves([20, 28, 36, 30])
+    images[:, :, labels[0] == 7] = 0.0
+    settings: dict[str, Any] = {"prune": 0.01, "softness": 0.0, "move_contours": False, "densify_from": 1.0}
+    report = fit(images[0], labels[0], 30, iterations=20, **settings).regions
+    assert report.empty == 1 and report == fit(images, labels, 30, iterations=20, **settings).regions[0]
 
 
 @pytest.mark.parametrize("one_region", [False, True])

@@ -39,10 +39,12 @@ def image() -> Tensor:
     return torch.stack([(0.3 * x).sin(), (0.2 * y).cos(), (0.1 * x * y).sin()]).mul(0.4).add(0.5)
 
 
-def run(stepper_of: Stepping = CudaStepper, on_step: Any = None, **settings: Any) -> FitResult:
-    """Fit 60 Gaussians with a stepper."""
-    config = FitConfig(**{"iterations": ITERATIONS, **settings})
-    return fit_problem(make_problem(image(), None, 60, config, 0), on_step, stepper_of=stepper_of)
+def run(
+    stepper_of: Stepping = CudaStepper, on_step: Any = None, images: Tensor | None = None, **settings: Any
+) -> FitResult:
+    """Fit 60 Gaussians with a stepper, to one image or to a batch."""
+    config, images = FitConfig(**{"iterations": ITERATIONS, **settings}), image() if images is None else images
+    return fit_problem(make_problem(images, None, 60, config, 0), on_step, stepper_of=stepper_of)
 
 
 def same(a: FitResult, b: FitResult) -> bool:
@@ -54,7 +56,7 @@ def same(a: FitResult, b: FitResult) -> bool:
 @pytest.fixture
 def adam_of_a_device(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     """Take GaussianAdam's form for devices: it leaves out gradients of NaN."""
-    monkeypatch.setattr(adam, "_raises", lambda parameter: False)
+    monkeypatch.setattr(adam, "_checks_gradients", lambda parameter: False)
     monkeypatch.setattr(adam, "_is_compiled", lambda *tensors: False)
     return monkeypatch
 
@@ -103,7 +105,9 @@ def test_the_errors_of_a_batch_are_those_of_each_image(objective: str, has_maps:
 
 
 def test_steps_that_are_not_waited_for_are_those_that_are() -> None:
-    assert same(run(EagerStepper), run(CudaStepper))
+    for images in (None, torch.stack([image(), image().flip(2).square()])):
+        assert same(run(EagerStepper, images=images), run(CudaStepper, images=images))
+        assert same(run(EagerStepper, images=images), run(lambda state: CudaStepper(state, IdleDevice), images=images))
 
 
 def test_a_late_history_is_the_history() -> None:
@@ -315,8 +319,8 @@ def test_no_step_waits_for_a_gpu(has_regions: bool) -> None:
         def measure(self, seconds: float) -> None:
             self.check("measure", seconds)
 
-        def has_diverged(self) -> bool:
-            return self.check("has_diverged")
+        def overflowing_images(self) -> list[int]:
+            return self.check("overflowing_images")
 
     class NeverReplaying(CudaStepper):
         def _can_replay(self) -> bool:

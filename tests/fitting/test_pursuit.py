@@ -283,7 +283,7 @@ class TestTriton:
         import triton
         from triton.backends.compiler import GPUTarget
 
-        from kcgs.fitting import cuda
+        from kcgs.fitting import pursuit_cuda as cuda
 
         monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
         constants = {"MAPPED": has_labels, "PIXELS": cuda._PIXELS}

@@ -29,7 +29,7 @@ def targets(progress: Iterable[float], **settings: Any) -> list[int]:
     """How many Gaussians the schedule asks for, of at most 60."""
     state, counts = state_of(60, **settings), []
     for state.progress in progress:
-        counts.append(Densify().target(state))
+        counts.append(Densify().target(state, state.num_initial))
     return counts
 
 

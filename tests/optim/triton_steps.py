@@ -26,7 +26,7 @@ def launches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         launch(*arguments)  # type: ignore[arg-type]
 
     monkeypatch.setattr(adam, "_launch", counted_launch)
-    monkeypatch.setattr(adam, "_raises", lambda parameter: False)
+    monkeypatch.setattr(adam, "_checks_gradients", lambda parameter: False)
     if DEVICE.type == "cpu":
         takes_triton = lambda *tensors: all(t.dtype is torch.float32 for t in tensors)  # noqa: E731
         monkeypatch.setattr(adam, "takes_triton", takes_triton)

@@ -39,9 +39,9 @@ class Densify:
     removals: int = 4
     """Number of removals in a cycle."""
 
-    def target(self, state: FitState) -> int:
-        """Return the number of Gaussians that the schedule asks for."""
-        first, final, progress = state.num_initial, state.problem.num_gaussians, state.progress
+    def target(self, state: FitState, first: int) -> int:
+        """Return the number of Gaussians that the schedule asks for, of an image that began with `first`."""
+        final, progress = state.problem.num_gaussians, state.progress
         surplus = self.surplus if state.problem.config.densify_from < 1.0 else 0.0
         most = round((1 + surplus) * final)
         if progress < self.begin:
@@ -62,7 +62,7 @@ class Densify:
         """Add or remove Gaussians where the schedule asks for another number, once a state was measured."""
         if state.num_cycles == 0 and state.progress >= self.end:  # from here on a clock changes it no more
             state.num_cycles = self._num_cycles(state)
-        target = self.target(state)
+        target = self.target(state, state.num_initial)
         if not state.history or target == state.num_requested:
             return
         if target < state.num_requested:
@@ -75,5 +75,6 @@ class Densify:
         state.num_requested = target
 
     def add(self, state: FitState, count: int) -> None:
-        """Add so many Gaussians, if any."""
-        add_gaussians(state, count)
+        """Add so many Gaussians, if any; fewer to images that began with fewer than others, as they would alone."""
+        most = self.target(state, state.num_initial)
+        add_gaussians(state, count, [most - self.target(state, first) for first in state.initial_counts])

@@ -53,7 +53,7 @@ class CudaStepper:
         state, rendered = self._state, self._rendered
         self._rendered = None
         if self._must_wait():
-            self._settle()
+            self._make_room()
             self._graph.forget()
         set_rates(state, rate)
         with self._running_ahead():
@@ -80,9 +80,9 @@ class CudaStepper:
             measurement, errors = self._pending.popleft()
             record(self._state, measurement, Errors(*errors.numbers()))
         if wait:
-            self._settle()
+            self._make_room()
 
-    def diverging(self) -> list[int]:
+    def overflowing_images(self) -> list[int]:
         """See :class:`Stepper`; up to 20 iterations late.
 
         Every ten iterations the host waits for the numbers of ten iterations before. There it also learns whether a
@@ -99,10 +99,9 @@ class CudaStepper:
         numbers, columns = previous.numbers(), sum(table.shape[-1] for table in tables)
         self._lacks_room |= bool(numbers[:, columns:].isnan().any())
         is_within = (numbers[:, :columns] < LARGEST).all(1)
-        is_within[self._state.diverged] = True
         return (~is_within).nonzero()[:, 0].tolist()
 
-    def _settle(self) -> None:
+    def _make_room(self) -> None:
         """Wait, and make room for what did not fit."""
         problem = self._state.problem
         settle(problem.device, problem.num_images, problem.size)

@@ -23,8 +23,8 @@ class Stepper(Protocol):
     def poll(self, *, wait: bool = False) -> None:
         """Record the measurements that the device is done with; `wait`: all of them."""
 
-    def diverging(self) -> list[int]:
-        """Return the images that begin to diverge: see :meth:`FitState.diverging`."""
+    def overflowing_images(self) -> list[int]:
+        """Return the images that overflow: see :meth:`FitState.overflowing_images`."""
 
 
 class EagerStepper:
@@ -48,6 +48,6 @@ class EagerStepper:
     def poll(self, *, wait: bool = False) -> None:
         """See :class:`Stepper`: all measurements are recorded."""
 
-    def diverging(self) -> list[int]:
+    def overflowing_images(self) -> list[int]:
         """See :class:`Stepper`."""
-        return self._state.diverging()
+        return self._state.overflowing_images()
