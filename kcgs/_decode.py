@@ -39,6 +39,21 @@ class Samples(NamedTuple):
     frames: int = 1  # number of images in the file: frames of an animation, or pages
 
 
+def read_size(path: str | os.PathLike[str]) -> tuple[int, int] | None:
+    """Read (height, width) of an upright image without its pixels; None where Pillow does not read the file."""
+    try:
+        with Image.open(path) as image:
+            width, height = image.size
+            return (width, height) if _orientation(image) >= 5 else (height, width)
+    except Exception:  # whoever reads the pixels says why
+        return None
+
+
+def _orientation(image: Image.Image) -> int:
+    """Return the orientation in EXIF; that of a TIFF is applied already."""
+    return 1 if image.format == "TIFF" else image.getexif().get(_ORIENTATION, 1)
+
+
 def decode(path: str | os.PathLike[str], *, indices: bool = False) -> Samples:
     """Decode the first frame, upright by its EXIF orientation; `indices`: palette images as their indices."""
     data = Path(path).read_bytes()
@@ -61,7 +76,7 @@ def decode(path: str | os.PathLike[str], *, indices: bool = False) -> Samples:
 
 def _pillow(data: bytes, image: Image.Image, indices: bool) -> Samples:
     # Pillow turns TIFF itself
-    orientation = 1 if image.format == "TIFF" else image.getexif().get(_ORIENTATION, 1)
+    orientation = _orientation(image)
     # in a PNG, byte 24 is the number of bits, and byte 25 the kind of colours: 2 is RGB, 6 RGBA
     if data.startswith(_PNG) and data[24] == 16 and data[25] in (2, 6):
         from kornia_rs.io import decode_image_png_u16

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import zlib
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -68,6 +70,48 @@ def deserialize(data: bytes) -> Scene:
         raise ValueError(f"its {FORMAT!r} must have an entry {error}") from error
     except (safetensors.SafetensorError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise ValueError(str(error)) from error
+
+
+class MappedScene:
+    """A batch of scenes in a .safetensors file whose tensors are mapped into memory, and read where they are used.
+
+    The checksum is not compared, which would read all of it: `deserialize` does.
+    """
+
+    def __init__(self, tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
+        self.tensors, self._header = tensors, header
+        height, width = header["size"]
+        self.size: tuple[int, int] = height, width
+        self.metadata: dict[str, str] = header["notes"]
+
+    @cached_property
+    def _regions(self) -> RegionMap | None:
+        """The label maps, which are compressed as one: all are read at once."""
+        if "labels" not in self.tensors:
+            return None
+        labels = _inflate(self.tensors["labels"], **self._header["labels"])
+        return RegionMap.from_labels(labels, softness_from_plain(self._header["softness"]))
+
+    def scene(self, index: int) -> Scene:
+        """Return one of the scenes, without rows of the colour 0."""
+        rows = (self.tensors["colors"][index] != 0).any(-1)
+        means, cholesky, colors = (self.tensors[name][index][rows] for name in _REQUIRED)
+        ids = self.tensors["region_ids"][index][rows].long() if "region_ids" in self.tensors else None
+        field = GaussianField(means, cholesky, colors, ids, size=self.size)
+        return Scene(field, None if self._regions is None else self._regions[index])
+
+
+def map_file(path: str | os.PathLike[str]) -> MappedScene:
+    """Map a batch of scenes in a .safetensors file into memory; ValueError if it is none."""
+    try:
+        with safetensors.safe_open(path, "pt") as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            notes = file.metadata() or {}
+        if not {*_REQUIRED} <= tensors.keys() or tensors["means"].ndim != 3:
+            raise ValueError(f"it must hold {', '.join(_REQUIRED)} of a batch; got {sorted(tensors)}")
+        return MappedScene(tensors, json.loads(notes[FORMAT]))
+    except (KeyError, safetensors.SafetensorError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} holds no batch of scenes: {error}") from error
 
 
 def _assemble(tensors: dict[str, Tensor], header: Any) -> Scene:

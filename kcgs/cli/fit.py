@@ -24,7 +24,7 @@ from .common import ImageFile, InterruptHandler, Json, Quiet, check_new, check_o
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from kcgs.fitting import FitResult
+    from kcgs.fitting import FitConfig, FitResult
     from kcgs.scene import Scene
 
 # dB by which a fit exceeds a target, for the rounding to a file to lose
@@ -104,35 +104,48 @@ def fit_and_save(
 ) -> SavedFit:
     """Fit an image, and write the scene or the compressed file, by the suffix of `output`."""
     from kcgs.fitting import fit
-    from kcgs.rate import compress, fit_bytes, quality_for
-    from kcgs.scene import Scene
+    from kcgs.rate import fit_bytes
 
-    config, is_compressed = request.load_config(), output.suffix == ".kcgs"
-    objective = objective_for("fit", config.objective)
-    if is_compressed and request.target_bytes is None:  # the file lowers what the fit does
-        objective = objective_for("file", objective)
-    target_psnr = config.target_psnr
-    if target_psnr is not None and is_compressed:
-        config = config.model_copy(update={"target_psnr": target_psnr + _ROUNDING_MARGIN})
-    device = request.load_device()
+    device, start = request.load_device(), time.perf_counter()
     on_device = image.to(device), None if labels is None else labels.to(device)
-    start = time.perf_counter()
-    settings: Any = {"recipe": config, "seed": request.seed, "on_step": on_step, "progress": progress}
+    settings: Any = {"recipe": config_for(output, request), "seed": request.seed}
+    settings |= {"on_step": on_step, "progress": progress}
     if request.target_bytes is not None:
         file = fit_bytes(*on_device, request.target_bytes, **settings)
         result, scene, num_bytes = file.result, file.scene, write_file(output, file.data)
-    elif is_compressed:
-        result = fit(*on_device, request.num_gaussians, **settings)
-        quality = quality_for(max(entry.psnr for entry in result.history)) if target_psnr is None else None
-        goal: Any = {"quality": quality, "target_psnr": target_psnr, "objective": objective}
-        with Progress("writing the file", pulse=True, visible=progress):
-            compressed = compress(result.scene, image, seed=request.seed, **goal)
-        scene, num_bytes = compressed.scene, write_file(output, compressed.data)
     else:
         result = fit(*on_device, request.num_gaussians, **settings)
-        scene = Scene(result.scene.field, result.scene.regions, {"recipe": request.recipe}).to("cpu")
-        num_bytes = scene.save(output)
+        scene, num_bytes = save_result(output, image, result, request, progress=progress)
     return SavedFit(result, scene, num_bytes, time.perf_counter() - start)
+
+
+def config_for(output: Path, request: options.FitRequest) -> FitConfig:
+    """Return the settings of a fit whose scene goes to a file: a compressed one loses some of a target."""
+    config = request.load_config()
+    if config.target_psnr is None or output.suffix != ".kcgs" or request.target_bytes is not None:
+        return config
+    return config.model_copy(update={"target_psnr": config.target_psnr + _ROUNDING_MARGIN})
+
+
+def save_result(
+    output: Path, image: Tensor, result: FitResult, request: options.FitRequest, *, progress: bool = False
+) -> tuple[Scene, int]:
+    """Write the scene of a fit of one image, by the suffix of `output`; return it as a reader has it, and the bytes."""
+    from kcgs.rate import compress, quality_for
+    from kcgs.scene import Scene
+
+    if output.suffix != ".kcgs":
+        scene = Scene(result.scene.field, result.scene.regions, {"recipe": request.recipe}).to("cpu")
+        return scene, scene.save(output)
+    config = request.load_config()
+    # the file lowers what the fit does
+    objective = objective_for("file", objective_for("fit", config.objective))
+    target_psnr = config.target_psnr
+    quality = quality_for(float(result.psnr)) if target_psnr is None else None
+    goal: Any = {"quality": quality, "target_psnr": target_psnr, "objective": objective}
+    with Progress("writing the file", pulse=True, visible=progress):
+        compressed = compress(result.scene, image, seed=request.seed, **goal)
+    return compressed.scene, write_file(output, compressed.data)
 
 
 def read_regions(

@@ -19,7 +19,15 @@ from kcgs.errors import InvalidArgument
 from . import options
 from .commands import app
 from .common import INTERRUPTED, Json, Quiet, print_report
-from .many_jobs import FitJob, Outcome, fit_one, is_done
+from .many_batches import complete_shards, count_done, make_batches, run_batch, takes_one_image
+from .many_jobs import FitJob, Outcome
+
+
+def _check_batch(value: str) -> str:
+    """Refuse what is neither auto nor a number of images."""
+    if value != "auto" and not (value.isdigit() and int(value) > 0):
+        raise InvalidArgument("batch", "auto, or a number of images", repr(value))
+    return value
 
 
 @app.command("fit-many")
@@ -45,12 +53,22 @@ def fit_many_command(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace files made with other settings or changed since.")
     ] = False,
+    batch: Annotated[
+        str,
+        typer.Option(metavar="auto|N", callback=_check_batch, help="Images of one size that are fitted together."),
+    ] = "auto",
+    shard: Annotated[
+        int | None,
+        typer.Option(min=1, help="Scenes of a file 00000.safetensors, ..., in place of a file for each image."),
+    ] = None,
     threshold: options.Threshold = None,
     resize_regions: options.ResizeRegions = False,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
-    """Fit many images, each into a scene or a compressed file of its own.
+    """Fit many images, each into a scene or a compressed file of its own, or many into a shard.
+
+    Images of one size are fitted together, which is faster and gives the same scenes on a CPU.
 
     The same command again goes on where an earlier one stopped: a file that was made from the same image, mask and
     settings, and not changed since, is kept; any other file that exists is an error of that image without --overwrite.
@@ -63,6 +81,8 @@ def fit_many_command(
         options.exclude("--target-bytes", suffix=suffix)
     if regions in ("auto", "none"):
         options.exclude(f"--regions {regions}", threshold=threshold)
+    if shard is not None:
+        options.exclude("--shard", suffix=suffix, target_bytes=request.target_bytes)
     jobs = [
         FitJob(
             image,
@@ -77,22 +97,31 @@ def fit_many_command(
     ]
     from kcgs.engine import run_jobs
 
-    request.load_config()  # refuses wrong settings before the work
+    single = takes_one_image(request)  # refuses wrong settings before the work
+    if single is not None and batch not in ("auto", "1"):
+        options.exclude(f"--{single}", batch=batch)
     output.mkdir(parents=True, exist_ok=True)
+    devices = _list_devices(request) if engine == "local" else [request.device]
+    on_gpu = devices[0].startswith("cuda")
     if workers is None and engine == "local":
-        workers = max(1, _count_cores() // threads)
-    workers = None if workers is None else min(workers, len(jobs))
+        # two processes per GPU: one reads and writes while the other one's images are fitted
+        workers = 2 * len(devices) if on_gpu else max(1, _count_cores() // threads)
+    batches = make_batches(jobs, "1" if single else batch, shard, workers or 1, devices, output)
+    workers = None if workers is None else min(workers, len(batches))
     outcomes = dict[int, Outcome]()
     try:
         with Progress("fit-many", visible=not quiet) as progress:
-            for index, outcome in run_jobs(fit_one, jobs, engine=engine, workers=workers, threads=threads):
-                outcomes[index] = outcome
+            work = run_jobs(run_batch, batches, engine=engine, workers=workers, threads=threads, gpus=int(on_gpu))
+            for number, results in work:
+                for index, outcome in zip(batches[number].indices, results, strict=True):
+                    outcomes[index] = outcome
+                    for warning in outcome.warnings:
+                        typer.echo(f"warning: {jobs[index].image.name}: {warning}", err=True)
                 progress.update(len(outcomes) / len(jobs), f"{len(outcomes)} of {len(jobs)}")
-                for warning in outcome.warnings:
-                    typer.echo(f"warning: {jobs[index].image.name}: {warning}", err=True)
+                complete_shards(batches, number, outcomes)
     except KeyboardInterrupt:
         # a worker may have written a file of which the main process did not hear
-        done = f"{sum(map(is_done, jobs))} of {len(jobs)} images are done"
+        done = f"{count_done(batches)} of {len(jobs)} images are done"
         typer.echo(f"kcgs: interrupted: {done}; the same command goes on where it stopped", err=True)
         raise typer.Exit(INTERRUPTED) from None
     finally:
@@ -149,6 +178,15 @@ def _by_stem(name: str, files: Iterable[Path]) -> dict[str, Path]:
         if by_stem.setdefault(file.stem, file) != file:
             raise InvalidArgument(name, "different stems", f"{by_stem[file.stem]} and {file}", verb="have")
     return by_stem
+
+
+def _list_devices(request: options.FitRequest) -> list[str]:
+    """Return the devices that the option names: "cuda" is all GPUs of the machine."""
+    if request.device != "cuda":
+        return [request.device]
+    import torch
+
+    return [f"cuda:{number}" for number in range(torch.cuda.device_count())] or [request.device]
 
 
 def _count_cores() -> int:

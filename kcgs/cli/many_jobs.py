@@ -1,18 +1,24 @@
-"""The job that `kcgs fit-many` runs for each image, in any process."""
+"""The job that `kcgs fit-many` runs for each batch of images, in any process: a file for each image."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from kcgs._atomic import write_file
 
 from .common import describe_error, replace_undefined
-from .fit import fit_and_save, read_regions, report_fit
+from .fit import SavedFit, fit_and_save, read_regions, report_fit, save_result
 from .options import FitRequest
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from kcgs.fitting import FitResult
 
 
 class FitJob(NamedTuple):
@@ -41,35 +47,123 @@ class Outcome(NamedTuple):
     warnings: tuple[str, ...] = ()
 
 
-def fit_one(job: FitJob) -> Outcome:
-    """Fit an image, write its scene and its row, unless they are there unchanged; an error is returned."""
+class Loaded(NamedTuple):
+    """An image and its label map, and what was said when they were read."""
+
+    image: Tensor
+    labels: Tensor | None
+    warnings: tuple[str, ...]
+
+
+class BatchFit(NamedTuple):
+    """The fit of one image of a batch."""
+
+    result: FitResult
+    seconds: float
+    """The share of the image in the time of the batch."""
+    warnings: tuple[str, ...]
+
+
+def load_job(job: FitJob) -> Loaded:
+    """Read the image of a job and its regions."""
     from kcgs.data import load_image
 
-    record = job.output.with_suffix(".json")
+    # a warning of one image among many must say which image: the caller does
+    with warnings.catch_warnings(record=True) as messages:
+        warnings.simplefilter("always", UserWarning)
+        image = load_image(job.image)
+        labels = read_regions(job.regions, image, job.threshold, resize=job.resize_regions)
+    return Loaded(image, labels, tuple(str(message.message) for message in messages))
+
+
+def fit_batch(loaded: Sequence[Loaded], request: FitRequest) -> list[BatchFit]:
+    """Fit images of one shape together."""
+    import torch
+
+    from kcgs.fitting import fit
+
+    device = request.load_device()
+    images = torch.stack([one.image for one in loaded]).to(device)
+    maps = [one.labels for one in loaded if one.labels is not None]
+    labels = torch.stack(maps).to(device) if maps else None
+    with warnings.catch_warnings(action="ignore", category=UserWarning):  # which speak of the batch: see _warnings_of
+        result = fit(images, labels, request.num_gaussians, recipe=request.load_config(), seed=request.seed)
+    seconds = result.seconds / len(loaded)
+    parts = [result.of_image(k) for k in range(len(loaded))]
+    return [BatchFit(part, seconds, _warnings_of(part, request)) for part in parts]
+
+
+def _warnings_of(result: FitResult, request: FitRequest) -> tuple[str, ...]:
+    """Say of one image of a batch what its fit alone would have warned of."""
+    from kcgs.fitting import describe_excess
+
+    messages = ["the fit diverged: the best so far is kept"] if result.diverged else []
+    report, count = result.regions, request.num_gaussians
+    if report is not None and not isinstance(report, list) and report.num_before > count and result.config.guidance:
+        messages.append(describe_excess(report.num_before - count, report.num_before, count, result.config))
+    return tuple(messages)
+
+
+def fit_jobs(jobs: Sequence[FitJob]) -> list[Outcome]:
+    """Fit images, those of one shape together; write a scene and a row of each, unless they are there unchanged.
+
+    An error of an image is returned, and stops no other.
+    """
+    outcomes: dict[int, Outcome] = {}
+    groups: dict[Any, dict[int, tuple[Loaded, str]]] = {}
+    for index, job in enumerate(jobs):
+        try:
+            fingerprint = _fingerprint(job)
+            if (kept := _read_unchanged(job, fingerprint)) is not None:
+                outcomes[index] = Outcome(kept, False)
+                continue
+            loaded = load_job(job)
+            # a command that is killed between scene and row knows the scene as its own when it is run again
+            write_file(job.output.with_suffix(".json"), json.dumps({"fingerprint": fingerprint}))
+            groups.setdefault((loaded.image.shape, loaded.labels is None), {})[index] = loaded, fingerprint
+        except Exception as error:
+            outcomes[index] = _failure(error)
+    for group in groups.values():
+        outcomes |= _fit_group(jobs, group)
+    return [outcomes[index] for index in range(len(jobs))]
+
+
+def _fit_group(jobs: Sequence[FitJob], group: dict[int, tuple[Loaded, str]]) -> dict[int, Outcome]:
+    """Fit images of one shape; where they cannot be fitted together, one by one."""
+    fits: dict[int, BatchFit] = {}
+    if len(group) > 1:
+        try:
+            request = jobs[min(group)].request
+            fits = dict(zip(group, fit_batch([loaded for loaded, _ in group.values()], request), strict=True))
+        except Exception:  # of one image: alone it says which
+            fits = {}
+    return {
+        index: _fit_and_save(jobs[index], loaded, fingerprint, fits.get(index))
+        for index, (loaded, fingerprint) in group.items()
+    }
+
+
+def _fit_and_save(job: FitJob, loaded: Loaded, fingerprint: str, fit: BatchFit | None) -> Outcome:
+    """Write the scene and the row of an image, which is fitted unless its fit is given."""
     try:
-        fingerprint = _fingerprint(job)
-        if job.output.is_file():
-            kept = _read_kept(job, fingerprint)
-            if kept is not None:
-                return Outcome(kept, False)
-            is_unfinished = _read_row(record) == {"fingerprint": fingerprint}
-            if not (is_unfinished or job.overwrite):
-                problem = "made with other settings or changed since"
-                raise FileExistsError(f"{job.output} exists, {problem}; --overwrite replaces it")
-        # a warning of one image among many must say which image: the caller does
         with warnings.catch_warnings(record=True) as messages:
             warnings.simplefilter("always", UserWarning)
-            image = load_image(job.image)
-            labels = read_regions(job.regions, image, job.threshold, resize=job.resize_regions)
-            # a command that is killed between scene and row knows the scene as its own when it is run again
-            write_file(record, json.dumps({"fingerprint": fingerprint}))
-            saved_fit = fit_and_save(job.output, image, labels, job.request)
-            report = report_fit(saved_fit, image, labels, job.output, job.request)
-            row = {**replace_undefined(report), "fingerprint": fingerprint}
-        write_file(record, json.dumps({**row, "checksum": _checksum(job.output, row)}))
-        return Outcome(row, True, tuple(str(message.message) for message in messages))
+            if fit is None:
+                saved_fit = fit_and_save(job.output, loaded.image, loaded.labels, job.request)
+            else:
+                scene, num_bytes = save_result(job.output, loaded.image, fit.result, job.request)
+                saved_fit = SavedFit(fit.result, scene, num_bytes, fit.seconds)
+            report = report_fit(saved_fit, loaded.image, loaded.labels, job.output, job.request)
+        row = {**replace_undefined(report), "fingerprint": fingerprint}
+        write_file(job.output.with_suffix(".json"), json.dumps({**row, "checksum": _checksum(job.output, row)}))
+        said = () if fit is None else fit.warnings
+        return Outcome(row, True, (*loaded.warnings, *said, *(str(message.message) for message in messages)))
     except Exception as error:
-        return Outcome({"error": describe_error(error)}, True)
+        return _failure(error)
+
+
+def _failure(error: Exception) -> Outcome:
+    return Outcome({"error": describe_error(error)}, True)
 
 
 def is_done(job: FitJob) -> bool:
@@ -78,6 +172,18 @@ def is_done(job: FitJob) -> bool:
         return _read_kept(job, _fingerprint(job)) is not None
     except OSError:
         return False
+
+
+def _read_unchanged(job: FitJob, fingerprint: str) -> dict[str, Any] | None:
+    """Return the row of a scene that is there unchanged; refuse one that may not be replaced."""
+    if not job.output.is_file():
+        return None
+    kept = _read_kept(job, fingerprint)
+    is_unfinished = _read_row(job.output.with_suffix(".json")) == {"fingerprint": fingerprint}
+    if kept is None and not (is_unfinished or job.overwrite):
+        problem = "made with other settings or changed since"
+        raise FileExistsError(f"{job.output} exists, {problem}; --overwrite replaces it")
+    return kept
 
 
 def _read_kept(job: FitJob, fingerprint: str) -> dict[str, Any] | None:
@@ -104,11 +210,14 @@ def _checksum(output: Path, row: dict[str, Any]) -> str:
 
 def _fingerprint(job: FitJob) -> str:
     """Hash the image, the mask and all settings."""
+    mask = job.regions.encode() if job.regions in ("auto", "none") else Path(job.regions).read_bytes()
+    return hashlib.sha256(b"\0".join((describe_settings(job).encode(), job.image.read_bytes(), mask))).hexdigest()
+
+
+def describe_settings(job: FitJob) -> str:
+    """Return all that a scene depends on besides the image and the mask."""
     request = job.request
     settings: tuple[Any, ...] = (
         request.load_config().model_dump_json(), request.num_gaussians, request.target_bytes, request.seed,
     )  # fmt: skip
-    if job.threshold is not None:
-        settings += (job.threshold,)
-    mask = job.regions.encode() if job.regions in ("auto", "none") else Path(job.regions).read_bytes()
-    return hashlib.sha256(b"\0".join((repr(settings).encode(), job.image.read_bytes(), mask))).hexdigest()
+    return repr(settings if job.threshold is None else (*settings, job.threshold))

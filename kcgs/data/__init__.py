@@ -1,13 +1,14 @@
-"""Images and label maps on disk, label maps in colours, charts, and DAVIS."""
+"""Images and label maps on disk, label maps in colours, charts, DAVIS, and data sets of scenes."""
 
 from kcgs.data.charts import ChartSample, chart_2x3, chart_pie
 from kcgs.data.colors import colorize_labels, label_colors, overlay_labels
 from kcgs.data.davis import Davis, DavisFrame
 from kcgs.data.images import load_image, save_image
 from kcgs.data.labels import load_labels, save_labels
+from kcgs.data.shards import SceneBatch, SceneDataset, save_shard
 
 __all__ = [
-    "ChartSample", "Davis", "DavisFrame", "chart_2x3", "chart_pie",
+    "ChartSample", "Davis", "DavisFrame", "SceneBatch", "SceneDataset", "chart_2x3", "chart_pie",
     "colorize_labels", "label_colors", "load_image", "load_labels", "overlay_labels",
-    "save_image", "save_labels",
+    "save_image", "save_labels", "save_shard",
 ]  # fmt: skip

@@ -36,6 +36,7 @@ def run_jobs(
     engine: str = "local",
     workers: int | None = None,
     threads: int = 1,
+    gpus: int = 0,
 ) -> Iterator[tuple[int, Result]]:
     """Run independent jobs, and yield the index and the result of each as it ends.
 
@@ -50,6 +51,7 @@ def run_jobs(
         engine: ``local``, or ``ray``: on the cluster at RAY_ADDRESS, or one on this machine that is shut down again.
         workers: jobs at a time. None: 1 locally, on Ray what its processors allow. With 1, ``local`` is this process.
         threads: of each job.
+        gpus: of each job, on Ray, which hands them out; a local job chooses its own.
 
     Returns:
         An iterator over all jobs in the order in which they end. The first job starts with the first `next`.
@@ -73,7 +75,7 @@ def run_jobs(
             from ray.util.multiprocessing import Pool
         except ImportError as error:
             raise ImportError("engine 'ray' needs the package ray: pip install 'kcgs[ray]'") from error
-        return _on_cluster(Pool, function, jobs, workers, threads)
+        return _on_cluster(Pool, function, jobs, workers, threads, gpus)
     if workers is None or workers == 1:
         return _in_this_process(function, jobs, threads)
     return _in_worker_processes(function, jobs, workers, threads)
@@ -137,7 +139,7 @@ def _set_threads(threads: int) -> None:
 
 
 def _on_cluster(
-    pool_type: Any, function: Callable[[Job], Result], jobs: Sequence[Job], workers: int | None, threads: int
+    pool_type: Any, function: Callable[[Job], Result], jobs: Sequence[Job], workers: int | None, threads: int, gpus: int
 ) -> Iterator[tuple[int, Result]]:
     import ray
     from ray.util.multiprocessing.pool import PoolTaskError
@@ -154,10 +156,16 @@ def _on_cluster(
         ray.init(log_to_driver=False, logging_level=logging.ERROR, **options)
     try:
         nodes: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]
-        capacity = sum([int(node["Resources"].get("CPU", 0)) // threads for node in nodes if node["Alive"]])
+        needs = {"CPU": threads, "GPU": gpus}
+        capacity = sum(
+            min(int(node["Resources"].get(name, 0)) // count for name, count in needs.items() if count)
+            for node in nodes
+            if node["Alive"]
+        )
         if capacity == 0:
-            raise InvalidArgument("threads", "at most the processors of a node of the cluster", threads)
-        size, resources = min(workers or capacity, capacity), {"num_cpus": threads}
+            needed = f"at most the processors of a node of the cluster{' with a GPU' if gpus else ''}"
+            raise InvalidArgument("threads", needed, threads)
+        size, resources = min(workers or capacity, capacity), {"num_cpus": threads, "num_gpus": gpus}
         with pool_type(size, _set_threads, (threads,), ray_remote_args=resources) as pool:
             for outcome in pool.imap_unordered(partial(_run_numbered, function), list(enumerate(jobs)), 1):
                 if isinstance(outcome, PoolTaskError):

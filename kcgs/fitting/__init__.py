@@ -4,7 +4,7 @@ from .checks import check_image_and_regions
 from .config import FitConfig, available_recipes
 from .contour_moves import move_contours
 from .initial import initial_field
-from .loop import fit, fit_problem, precompile
+from .loop import describe_excess, fit, fit_problem, precompile
 from .problem import Problem, make_problem
 from .pursuit import propose_for, propose_gaussians
 from .region_report import RegionReport, report_regions

@@ -6,10 +6,9 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from kcgs.functional import RegionMap
-from kcgs.nn import GaussianField
+from kcgs.nn import GaussianField, pad_rows
 from kcgs.scene import Scene
 
 from .batch_maps import join_maps
@@ -51,18 +50,12 @@ class Best(NamedTuple):
 def _choose(mask: Tensor, first: GaussianField, second: GaussianField) -> GaussianField:
     """Return the images of the first field where the mask, (B,), is true, else those of the second."""
     most = max(first.num_gaussians, second.num_gaussians)
-
-    def choose(a: Tensor, b: Tensor, fill: float) -> Tensor:
-        a, b = (pad(table.detach(), (0, 0, 0, most - table.shape[1]), value=fill) for table in (a, b))
-        return torch.where(mask[:, None, None], a, b)
-
-    means, cholesky = choose(first.means, second.means, 1.0), choose(first.cholesky, second.cholesky, 1.0)
+    first, second = pad_rows(first, most), pad_rows(second, most)
+    means, cholesky, colors = (
+        torch.where(mask[:, None, None], getattr(first, name).detach(), getattr(second, name).detach())
+        for name in ("means", "cholesky", "colors")
+    )
     ids = None
     if first.region_ids is not None and second.region_ids is not None:
-        # a row that is added is of the region of the first one, which its map has
-        ids = choose(_padded(first.region_ids, most), _padded(second.region_ids, most), 0)[..., 0]
-    return GaussianField(means, cholesky, choose(first.colors, second.colors, 0.0), ids, size=first.size)
-
-
-def _padded(ids: Tensor, count: int) -> Tensor:
-    return torch.cat([ids, ids[:, :1].expand(-1, count - ids.shape[1])], 1)[..., None]
+        ids = torch.where(mask[:, None], first.region_ids, second.region_ids)
+    return GaussianField(means, cholesky, colors, ids, size=first.size)

@@ -208,9 +208,12 @@ def _run(
 
 def _warn_of_regions(problem: Problem) -> None:
     """Warn where there are more regions than Gaussians."""
-    if problem.num_excess_regions == 0 or problem.regions is None:
-        return
-    effect = "were merged with others" if problem.config.merge_regions else "get no Gaussian and stay black"
-    total = sum(regions_per_map(problem.regions))
-    regions = f"{problem.num_excess_regions} of {total} regions {effect}"
-    warn_user(f"{regions}: there are more than num_gaussians, {problem.num_gaussians}")
+    if problem.num_excess_regions > 0 and problem.regions is not None:
+        total = sum(regions_per_map(problem.regions))
+        warn_user(describe_excess(problem.num_excess_regions, total, problem.num_gaussians, problem.config))
+
+
+def describe_excess(excess: int, num_regions: int, num_gaussians: int, config: FitConfig) -> str:
+    """Say what becomes of the regions beyond the number of Gaussians."""
+    effect = "were merged with others" if config.merge_regions else "get no Gaussian and stay black"
+    return f"{excess} of {num_regions} regions {effect}: there are more than num_gaussians, {num_gaussians}"

@@ -61,6 +61,28 @@ class FitResult(NamedTuple):
     diverged: tuple[int, ...] = ()
     """Images whose numbers overflowed; their scenes are the best of before."""
 
+    def of_image(self, index: int) -> FitResult:
+        """Return the result of one image of a batch: its scene, without rows of the colour 0, PSNR and report.
+
+        The history stays that of the batch.
+
+        Example:
+            >>> from kcgs import fit
+            >>> images = torch.stack([torch.zeros(3, 16, 24), torch.rand(3, 16, 24)])
+            >>> batch = fit(images, num_gaussians=8, iterations=20)
+            >>> batch.of_image(0).scene.num_gaussians, batch.of_image(1).scene.num_gaussians
+            (0, 8)
+        """
+        scene = self.scene[index]
+        field = scene.field.subset((scene.field.colors != 0).any(-1))
+        numbers = (torch.as_tensor(values)[index].item() for values in (self.num_pruned, self.prune_error, self.psnr))
+        num_pruned, prune_error, psnr = numbers
+        return self._replace(
+            scene=Scene(field, scene.regions, scene.metadata), num_pruned=int(num_pruned), prune_error=prune_error,
+            psnr=psnr, regions=self.regions[index] if isinstance(self.regions, list) else None,
+            diverged=(0,) if index in self.diverged else (),
+        )  # fmt: skip
+
     def __repr__(self) -> str:
         psnr = float(torch.as_tensor(self.psnr).mean())
         return f"FitResult({psnr:.2f} dB, stopped by {self.stop_reason}, {self.seconds:.1f} s, {self.scene!r})"

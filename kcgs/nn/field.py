@@ -321,16 +321,20 @@ def join(first: GaussianField, second: GaussianField) -> GaussianField:
     return GaussianField(means, cholesky, concatenate(first.colors, second.colors), ids, opacities, size=first.size)
 
 
-def pad_rows(field: GaussianField, count: int, regions: RegionMap | None) -> GaussianField:
-    """Return a field of one image, without opacities, with rows of the colour 0 up to a number, and without the graph.
+def pad_rows(field: GaussianField, count: int, regions: RegionMap | None = None) -> GaussianField:
+    """Return a field without opacities with rows of the colour 0 up to a number for each image, and without the graph.
 
-    With a map, the rows are of its first region, and so are all Gaussians of a field without ids.
+    The rows are of the region of an image's first Gaussian, or with a map of its first region; with a map all Gaussians
+    of a field without ids are, too.
     """
-    missing = (0, 0, 0, count - field.num_gaussians)
-    means, cholesky = (pad(table.detach(), missing, value=1.0) for table in (field.means, field.cholesky))
-    ids = None
-    if regions is not None:
-        ids = regions.ids[:1].expand(count).clone()
-        if field.region_ids is not None:
-            ids[: field.num_gaussians] = field.region_ids
-    return GaussianField(means, cholesky, pad(field.colors.detach(), missing), ids, size=field.size)
+    missing, ids = count - field.num_gaussians, field.region_ids
+    means, cholesky, colors = (
+        pad(table.detach(), (0, 0, 0, missing), value=fill)
+        for table, fill in ((field.means, 1.0), (field.cholesky, 1.0), (field.colors, 0.0))
+    )
+    if regions is not None and ids is None:
+        ids = regions.ids[:1].expand(means.shape[:-1])
+    elif ids is not None:
+        first = ids[..., :1] if regions is None else regions.ids[:1]
+        ids = torch.cat([ids, first.expand(*ids.shape[:-1], missing)], -1)
+    return GaussianField(means, cholesky, colors, ids, size=field.size)

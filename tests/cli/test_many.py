@@ -18,12 +18,13 @@ import torch
 from PIL import Image
 
 from kcgs import load
-from kcgs.cli import many_jobs
-from kcgs.data import save_image, save_labels
+from kcgs.cli import many_jobs, many_shards
+from kcgs.data import SceneDataset, save_image, save_labels
 from tests.cli.conftest import Kcgs, Run
 
 FIT = ("-n", "12", "--iterations", "3", "--workers", "1", "-o", "out")
 SETTINGS = (*FIT, "--regions", "none")
+ALONE = (*SETTINGS, "--batch", "1")
 
 
 @pytest.fixture(autouse=True)
@@ -145,7 +146,7 @@ class TestResume:
             "if __name__ == '__main__': main()\n"
         )
         Path("script.py").write_text(code)
-        command = [sys.executable, "script.py", "fit-many", "photos", *SETTINGS, "--workers", "2"]
+        command = [sys.executable, "script.py", "fit-many", "photos", *ALONE, "--workers", "2"]
         scene, record = Path("out/a.safetensors"), Path("out/a.json")
         process = subprocess.Popen(command, start_new_session=True)
         try:
@@ -157,7 +158,7 @@ class TestResume:
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
         content, written = scene.read_bytes(), scene.stat().st_mtime_ns
-        code_again, out, err = fit_many("photos", *SETTINGS, "--json")
+        code_again, out, err = fit_many("photos", *ALONE, "--json")
         assert code_again == 0, err
         assert json.loads(out)["fitted"] == 2 and list(rows()) == ["a", "b", "c"]
         assert (scene.read_bytes(), scene.stat().st_mtime_ns) == (content, written)
@@ -178,15 +179,15 @@ class TestResume:
             "if __name__ == '__main__': main()\n"
         )
         Path("script.py").write_text(code)
-        command = [sys.executable, "script.py", "fit-many", "photos", *SETTINGS, "--workers", "2"]
+        command = [sys.executable, "script.py", "fit-many", "photos", *ALONE, "--workers", "2"]
         ended = subprocess.run(command, capture_output=True, text=True, check=False)
         assert (ended.returncode, ended.stderr) == (1, (
             "kcgs: a worker process was killed, perhaps because memory ran out: the same command goes on where it "
             "stopped\n"
         ))  # fmt: skip
         scene = Path("out/a.safetensors").read_bytes()
-        assert json.loads(fit_many("photos", *SETTINGS, "--json").out)["fitted"] <= 2 and len(rows()) == 3
-        assert fit_many("photos/a.png", *SETTINGS, "-o", "again").code == 0
+        assert json.loads(fit_many("photos", *ALONE, "--json").out)["fitted"] <= 2 and len(rows()) == 3
+        assert fit_many("photos/a.png", *ALONE, "-o", "again").code == 0
         assert Path("again/a.safetensors").read_bytes() == scene == Path("out/a.safetensors").read_bytes()
 
     def test_interrupted(self, fit_many: Kcgs, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -198,7 +199,7 @@ class TestResume:
         fit_and_save = many_jobs.fit_and_save
         monkeypatch.setattr(many_jobs, "fit_and_save", interrupt)
         message = "kcgs: interrupted: 1 of 3 images are done; the same command goes on where it stopped\n"
-        assert fit_many("photos", *SETTINGS) == (130, "", message)
+        assert fit_many("photos", *ALONE) == (130, "", message)
         assert list(rows()) == ["a"]
 
     def test_interrupted_again(self, fit_many: Kcgs, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -254,3 +255,102 @@ class TestFailures:
         code, out, err = fit_many("broken", "broken/anim.gif", *SETTINGS, "--json")
         assert code == 0 and json.loads(out)["images"] == 1, err
         assert err.startswith("warning: anim.gif: ")
+
+
+class TestBatches:
+    @pytest.mark.parametrize("regions", ["none", "auto"])
+    @pytest.mark.parametrize("suffix", [".safetensors", ".kcgs"])
+    def test_the_files_of_a_batch_are_those_of_images_alone(self, fit_many: Kcgs, regions: str, suffix: str) -> None:
+        """Also with an image of another size, one that nobody can read, and one that lies on its side."""
+        Image.new("RGB", (20, 30), "red").save("photos/tall.png")
+        turned = Image.open("photos/a.png").transpose(Image.Transpose.ROTATE_90)
+        turned.save("photos/turned.jpg", exif=_orientation(6))
+        arguments = ("photos", "broken", *FIT, "--regions", regions, "--iterations", "40", "--suffix", suffix)
+        for output, batch in (("out", "auto"), ("alone", "1"), ("pairs", "2")):
+            code, _, err = fit_many(*arguments, "-o", output, "--batch", batch)
+            assert code == 1 and err.startswith("kcgs: d.png: ")
+        for stem in ("a", "b", "c", "tall", "turned"):
+            alone, *others = (Path(folder, f"{stem}{suffix}").read_bytes() for folder in ("alone", "out", "pairs"))
+            assert others == [alone, alone]
+        assert not Path("out/d.safetensors").exists()
+
+    def test_options_that_fit_one_image(self, fit_many: Kcgs) -> None:
+        for option in ("--max-seconds", "--target-psnr", "--target-bytes"):
+            code, _, err = fit_many("photos", "-o", "out", option, "90", "--batch", "2")
+            assert code == 2 and f"left out with {option}" in err
+        assert fit_many("photos", *SETTINGS, "--batch", "some").code == 2
+
+    def test_an_error_of_the_fit_stops_one_image(self, fit_many: Kcgs, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(many_jobs, "fit_batch", lambda *_: 1 / 0)
+        code, out, _ = fit_many("photos", *SETTINGS, "--json")
+        assert code == 0 and json.loads(out)["fitted"] == 3
+
+    def test_warnings_name_the_image(self, fit_many: Kcgs) -> None:
+        code, _, err = fit_many("photos/a.png", "photos/b.png", *FIT, "--regions", "masks", "-n", "1")
+        lines = err.splitlines()
+        assert code == 0 and len(lines) == 2 and lines[0].startswith("warning: a.png: 1 of 2 regions were merged")
+
+
+def _orientation(value: int) -> Image.Exif:
+    exif = Image.Exif()
+    exif[274] = value
+    return exif
+
+
+class TestShards:
+    ARGUMENTS = ("photos", "broken", *SETTINGS, "--shard", "2", "--batch", "1", "--json")
+
+    def test_shards_hold_what_files_hold(self, fit_many: Kcgs) -> None:
+        code, out, err = fit_many(*self.ARGUMENTS)
+        report = json.loads(out)
+        assert (code, report["images"], report["fitted"], report["failed"]) == (1, 4, 3, 1) and "d.png" in err
+        assert {path.name for path in Path("out").iterdir()} == {
+            "00000.safetensors", "00001.safetensors", "results.csv"
+        }  # fmt: skip
+        assert fit_many("photos", *SETTINGS, "-o", "alone").code == 0
+        dataset = SceneDataset("out")
+        assert dataset.names == ["a.png", "b.png", "c.png"]
+        for index, stem in enumerate("abc"):
+            scene, alone = dataset[index], load(f"alone/{stem}.safetensors")
+            assert torch.equal(scene.field.means, alone.field.means)
+            assert float(rows()[stem]["psnr"]) == float(dataset.psnr[index])
+        assert dataset.__getitems__([0, 2]).means.shape == (2, 12, 2)
+
+    def test_goes_on(self, fit_many: Kcgs, monkeypatch: pytest.MonkeyPatch) -> None:
+        """An interrupted command loses one batch; a complete one does nothing."""
+        arguments = ("photos", *SETTINGS, "--shard", "4", "--batch", "1", "--json")
+        fit_batch, count = many_shards.fit_batch, 0
+
+        def interrupt(*values: Any) -> Any:
+            nonlocal count
+            count += 1
+            return signal.raise_signal(signal.SIGINT) if count == 2 else fit_batch(*values)
+
+        monkeypatch.setattr(many_shards, "fit_batch", interrupt)
+        code, _, err = fit_many(*arguments)
+        assert code == 130 and err.startswith("kcgs: interrupted: 1 of 3 images are done;"), err
+        assert [path.name for path in Path("out").glob("*.safetensors")] == ["00000.part0000.safetensors"]
+        code, out, err = fit_many(*arguments)
+        assert code == 0 and [json.loads(out)[key] for key in ("fitted", "kept")] == [2, 1], err
+        assert [path.name for path in Path("out").glob("*.safetensors")] == ["00000.safetensors"]
+        before = Path("out/00000.safetensors").read_bytes(), rows()
+        code, out, _ = fit_many(*arguments)
+        assert [json.loads(out)[key] for key in ("fitted", "kept")] == [0, 3]
+        assert before == (Path("out/00000.safetensors").read_bytes(), rows())
+        code, out, err = fit_many(*arguments, "--seed", "1")
+        assert code == 1 and "00000.safetensors exists, made from other images or with other settings" in err
+        assert json.loads(fit_many(*arguments, "--seed", "1", "--overwrite").out)["fitted"] == 3
+
+    def test_maps_and_sizes(self, fit_many: Kcgs) -> None:
+        """A shard has images of one size, each with its map."""
+        Image.new("RGB", (20, 30), "red").save("photos/tall.png")
+        code, _, err = fit_many("photos", *FIT, "--shard", "9")
+        assert code == 0, err
+        dataset = SceneDataset("out")
+        assert dataset.names == ["a.png", "b.png", "c.png", "tall.png"]
+        assert [dataset[k].size for k in range(4)] == [(24, 36)] * 3 + [(30, 20)]
+        assert dataset[0].regions is not None
+
+    def test_options_without_meaning(self, fit_many: Kcgs) -> None:
+        code, _, err = fit_many("photos", "-o", "out", "--shard", "9", "--suffix", ".kcgs")
+        assert code == 2 and "left out with --shard" in err

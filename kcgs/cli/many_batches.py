@@ -1,0 +1,122 @@
+"""The batches of `kcgs fit-many`: images of one size that are fitted together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from .many_jobs import FitJob, Outcome, fit_jobs, is_done
+from .many_shards import ShardPart, complete_shard, fingerprint_of, fit_part
+from .options import FitRequest
+
+# pixels of a batch: on a core more leave its cache, and a GPU is busy from then on
+_CORE_PIXELS = 1 << 17
+_GPU_PIXELS = 1 << 22
+
+Size = tuple[int, int]
+
+
+class Batch(NamedTuple):
+    """Images that one job fits."""
+
+    indices: tuple[int, ...]
+    """Of the images among all of the command."""
+    work: tuple[FitJob, ...] | ShardPart
+
+
+def run_batch(batch: Batch) -> list[Outcome]:
+    """Fit the images of a batch; the outcomes are in their order."""
+    return fit_part(batch.work) if isinstance(batch.work, ShardPart) else fit_jobs(batch.work)
+
+
+def count_done(batches: Sequence[Batch]) -> int:
+    """Count the images whose scenes are on disk, from the same images and settings."""
+    files = (batch.work for batch in batches if not isinstance(batch.work, ShardPart))
+    parts = (batch.work for batch in batches if isinstance(batch.work, ShardPart))
+    num_in_shards = sum(len(part.images) for part in parts if part.is_done())
+    return num_in_shards + sum(is_done(job) for jobs in files for job in jobs)
+
+
+def takes_one_image(request: FitRequest) -> str | None:
+    """Name the option of a request by which images are fitted one by one; None: they may be fitted together."""
+    config = request.load_config()
+    values = {
+        "target-bytes": request.target_bytes, "target-psnr": config.target_psnr, "max-seconds": config.max_seconds,
+    }  # fmt: skip
+    return next((name for name, value in values.items() if value is not None), None)
+
+
+def make_batches(
+    jobs: Sequence[FitJob], batch: str, shard: int | None, workers: int, devices: Sequence[str], output: Path
+) -> list[Batch]:
+    """Divide images into batches of one size.
+
+    Args:
+        jobs: an image each.
+        batch: number of images, or auto.
+        shard: number of scenes of a file; None: a file for each image.
+        workers: batches at a time: none is to be without one.
+        devices: batches take turns on them.
+        output: folder of the shards.
+    """
+    groups = _by_size(jobs) if batch != "1" or shard is not None else {None: [*range(len(jobs))]}
+    on_gpu = devices[0].startswith("cuda")
+    batches: list[Batch] = []
+    num_shards = 0
+    for size, indices in groups.items():
+        count = _auto_batch(size, len(indices), workers, on_gpu) if batch == "auto" else int(batch)
+        for members in _chunks(indices, shard or len(indices)):
+            parts = [*_chunks(members, count)]
+            fingerprint = "" if shard is None else fingerprint_of([jobs[index] for index in members])
+            for number, part in enumerate(parts):
+                device = devices[len(batches) % len(devices)]
+                chosen = tuple(jobs[k]._replace(request=jobs[k].request._replace(device=device)) for k in part)
+                work: tuple[FitJob, ...] | ShardPart = chosen
+                if shard is not None:
+                    work = ShardPart(_shard_path(output, num_shards), number, chosen, size, fingerprint)
+                batches.append(Batch(tuple(part), work))
+            num_shards += 1
+    return batches
+
+
+def complete_shards(batches: Sequence[Batch], number: int, outcomes: Mapping[int, Outcome]) -> None:
+    """Write the shard of the batch that was done last, once all its parts are."""
+    work = batches[number].work
+    if not isinstance(work, ShardPart):
+        return
+    same = [b for b in batches if isinstance(b.work, ShardPart) and b.work.shard == work.shard]
+    if all(index in outcomes for batch in same for index in batch.indices):
+        complete_shard([batch.work for batch in same if isinstance(batch.work, ShardPart)])
+
+
+def _by_size(jobs: Sequence[FitJob]) -> dict[Size | None, list[int]]:
+    """Group images by size, in the order of their first image; those that nobody can read are with the first group."""
+    from kcgs._decode import read_size
+
+    groups: dict[Size | None, list[int]] = {}
+    for index, job in enumerate(jobs):
+        groups.setdefault(read_size(job.image), []).append(index)
+    if len(groups) > 1:
+        unknown = groups.pop(None, [])
+        first = next(iter(groups.values()))
+        first[:] = sorted(first + unknown)
+    return groups
+
+
+def _auto_batch(size: Size | None, count: int, workers: int, on_gpu: bool) -> int:
+    """Return how many images of a size are fitted together."""
+    if size is None:
+        return 1
+    suitable = (_GPU_PIXELS if on_gpu else _CORE_PIXELS) // (size[0] * size[1])
+    return max(1, min(suitable, -(-count // workers)))
+
+
+def _chunks(items: Sequence[int], count: int) -> Iterator[Sequence[int]]:
+    return (items[first : first + count] for first in range(0, len(items), count))
+
+
+def _shard_path(output: Path, number: int) -> Path:
+    from kcgs.data.shards import shard_path
+
+    return shard_path(output.absolute(), number)

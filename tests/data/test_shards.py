@@ -1,0 +1,112 @@
+"""Shards of scenes, and the data set over them."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from kcgs import GaussianField, RegionMap, Scene, load
+from kcgs.data import SceneBatch, SceneDataset, save_shard
+
+SIZE = (16, 24)
+
+
+def scenes_of(count: int, has_maps: bool = False, num_gaussians: int = 9, seed: int = 0) -> Scene:
+    """Scenes whose last rows have the colour 0, in the first one row, in the second two."""
+    generator = torch.Generator().manual_seed(seed)
+    means = torch.rand(count, num_gaussians, 2, generator=generator) * torch.tensor([24.0, 16.0])
+    colors = torch.rand(count, num_gaussians, 3, generator=generator) + 0.1
+    for k in range(count):
+        colors[k, num_gaussians - k - 1 :] = 0.0
+    cholesky = torch.tensor([2.0, 0.5, 1.5]).expand(count, num_gaussians, 3)
+    if not has_maps:
+        return Scene(GaussianField(means, cholesky, colors, size=SIZE))
+    maps = [RegionMap(torch.arange(24).expand(SIZE) // (4 + k) + k, 0.3 * k) for k in range(count)]
+    field = GaussianField(means, cholesky, colors, size=SIZE)
+    regions = RegionMap.stack(maps)
+    return Scene(field.assign_regions(regions), regions)
+
+
+def write(folder: Path, has_maps: bool = False) -> list[Scene]:
+    """Write shards of 3 and 2 scenes; return all of them."""
+    parts = [scenes_of(3, has_maps), scenes_of(2, has_maps, seed=1)]
+    for number, (part, names) in enumerate(zip(parts, ("abc", "de"), strict=True)):
+        save_shard(folder / f"0000{number}.safetensors", part, names, [20.0 + k for k in range(len(names))])
+    return [scene for part in parts for scene in part]
+
+
+@pytest.mark.parametrize("has_maps", [False, True])
+def test_an_index_gives_a_scene(has_maps: bool, tmp_path: Path) -> None:
+    expected = write(tmp_path, has_maps)
+    Path(tmp_path / "00001.part0000.safetensors").write_bytes(b"")  # of a shard that is not complete
+    dataset = SceneDataset(tmp_path)
+    assert (len(dataset), "".join(dataset.names), dataset.psnr.tolist()) == (5, "abcde", [20, 21, 22, 20, 21])
+    for index, scene in enumerate(expected):
+        actual = dataset[index]
+        assert actual.num_gaussians == int((scene.field.colors != 0).any(-1).sum()) < 9
+        torch.testing.assert_close(actual.render(), scene.render())
+        if has_maps:
+            assert torch.equal(actual.regions.labels, scene.regions.labels)
+            assert actual.regions.softness == scene.regions.softness
+    assert torch.equal(dataset[-1].field.means, dataset[4].field.means)
+    with pytest.raises(IndexError):
+        dataset[5]
+
+
+@pytest.mark.parametrize("has_maps", [False, True])
+@pytest.mark.parametrize(("workers", "start"), [(0, None), (1, "fork"), (1, "spawn")])
+def test_batches_are_tensors_in_the_order_of_the_sampler(
+    has_maps: bool, workers: int, start: str | None, tmp_path: Path
+) -> None:
+    expected = write(tmp_path, has_maps)
+    dataset = SceneDataset(tmp_path)
+    loader = DataLoader(
+        dataset, batch_size=2, sampler=[4, 0, 3, 2, 1], collate_fn=dataset.collate, num_workers=workers,
+        multiprocessing_context=start,
+    )  # fmt: skip
+    batches = list(loader)
+    assert all(isinstance(batch, SceneBatch) for batch in batches)
+    assert torch.cat([batch.positions for batch in batches]).tolist() == [4, 0, 3, 2, 1]
+    for name in ("means", "cholesky", "colors", *(["region_ids"] if has_maps else [])):
+        rows = torch.cat([getattr(batch, name) for batch in batches])
+        assert torch.equal(rows, torch.stack([getattr(expected[k].field, name) for k in (4, 0, 3, 2, 1)]))
+    assert (batches[0].region_ids is None) != has_maps
+
+
+def test_a_copy_opens_the_files_itself(tmp_path: Path) -> None:
+    write(tmp_path)
+    dataset = SceneDataset(tmp_path)
+    dataset[0]
+    content = pickle.dumps(dataset)
+    assert len(content) < 2_000 and torch.equal(pickle.loads(content)[3].field.means, dataset[3].field.means)
+
+
+def test_a_shard_is_a_scene_file(tmp_path: Path) -> None:
+    write(tmp_path, has_maps=True)
+    scene = load(tmp_path / "00000.safetensors")
+    assert len(scene) == 3 and scene.metadata["names"] == '["a", "b", "c"]'
+    torch.testing.assert_close(scene.render(), scenes_of(3, has_maps=True).render())
+
+
+def test_what_is_no_data_set(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="folder must hold shards, such as 00000.safetensors; got"):
+        SceneDataset(tmp_path)
+    scenes_of(2).save(tmp_path / "00000.safetensors")
+    with pytest.raises(ValueError, match=r"00000.safetensors is no shard: its metadata lack names and psnr"):
+        SceneDataset(tmp_path)
+    scenes_of(2)[0].save(tmp_path / "00000.safetensors")
+    with pytest.raises(ValueError, match=r"holds no batch of scenes: it must hold means, cholesky, colors of a batch"):
+        SceneDataset(tmp_path)
+    (tmp_path / "00000.safetensors").write_bytes(b"nothing")
+    with pytest.raises(ValueError, match="holds no batch of scenes"):
+        SceneDataset(tmp_path)
+    for number, rows in enumerate((9, 8)):
+        save_shard(tmp_path / f"0000{number}.safetensors", scenes_of(2, num_gaussians=rows), "ab", [1.0, 2.0])
+    with pytest.raises(ValueError, match="folder must hold shards of as many rows and channels"):
+        SceneDataset(tmp_path)
+    with pytest.raises(ValueError, match="names must be one for each of 2 scenes; got 3"):
+        save_shard(tmp_path / "00002.safetensors", scenes_of(2), "abc", [1.0, 2.0])
