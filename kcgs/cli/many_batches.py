@@ -117,6 +117,6 @@ def _chunks(items: Sequence[int], count: int) -> Iterator[Sequence[int]]:
 
 
 def _shard_path(output: Path, number: int) -> Path:
-    from kcgs.data.shards import shard_path
+    from kcgs.data import shard_path
 
     return shard_path(output.absolute(), number)

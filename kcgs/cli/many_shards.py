@@ -67,7 +67,7 @@ def fit_part(part: ShardPart) -> list[Outcome]:
 
 def _fit_and_save(part: ShardPart, loaded: dict[int, Loaded], errors: dict[int, str]) -> dict[int, Outcome]:
     """Fit images of one shape, and write the part."""
-    from kcgs.data.shards import save_shard, stack_scenes
+    from kcgs.data import save_shard, stack_scenes
 
     request = part.images[0].request
     try:
@@ -117,7 +117,7 @@ def _notes(path: Path) -> dict[str, str]:
 
 def complete_shard(parts: Sequence[ShardPart]) -> None:
     """Write a shard from its parts, and remove these; nothing where the shard is there, or no image was fitted."""
-    from kcgs.data.shards import save_shard, stack_scenes
+    from kcgs.data import save_shard, stack_scenes
     from kcgs.files import load
 
     scenes = [load(part.path) for part in parts if part.path.is_file()]

@@ -5,8 +5,9 @@ from kcgs.data.colors import colorize_labels, label_colors, overlay_labels
 from kcgs.data.davis import Davis, DavisFrame
 from kcgs.data.images import load_image, save_image
 from kcgs.data.labels import load_labels, save_labels
-from kcgs.data.shards import SceneBatch, SceneDataset, save_shard
+from kcgs.data.shards import SceneBatch, SceneDataset, save_shard, shard_path, stack_scenes
 
+# public; what else is imported here is for the other rooms of kcgs
 __all__ = [
     "ChartSample", "Davis", "DavisFrame", "SceneBatch", "SceneDataset", "chart_2x3", "chart_pie",
     "colorize_labels", "label_colors", "load_image", "load_labels", "overlay_labels",
