@@ -68,13 +68,18 @@ def fit_part(part: ShardPart) -> list[Outcome]:
 def _fit_and_save(part: ShardPart, loaded: dict[int, Loaded], errors: dict[int, str]) -> dict[int, Outcome]:
     """Fit images of one shape, and write the part."""
     from kcgs.data import save_shard, stack_scenes
+    from kcgs.fitting import rank_gaussians
+    from kcgs.nn import reorder_rows
+    from kcgs.scene import Scene
 
     request = part.images[0].request
     try:
         fits = fit_batch([*loaded.values()], request)
     except Exception as error:  # of all of them: their images and maps were read
         return {index: Outcome({"error": describe_error(error)}, True) for index in loaded}
-    scenes = stack_scenes([fit.result.scene.to("cpu") for fit in fits], request.num_gaussians)
+    scenes = stack_scenes([fit.result.scene for fit in fits], request.num_gaussians)
+    field = reorder_rows(scenes.field, rank_gaussians(scenes.field, scenes.regions))
+    scenes = Scene(field, scenes.regions).to("cpu")
     names = [part.images[index].image.name for index in loaded]
     psnr = [float(fit.result.psnr) for fit in fits]
     rows = [

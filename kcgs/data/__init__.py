@@ -1,11 +1,11 @@
 """Images and label maps on disk, label maps in colours, charts, DAVIS, and data sets of scenes."""
 
-from kcgs.data.charts import ChartSample, chart_2x3, chart_pie
-from kcgs.data.colors import colorize_labels, label_colors, overlay_labels
-from kcgs.data.davis import Davis, DavisFrame
-from kcgs.data.images import load_image, save_image
-from kcgs.data.labels import load_labels, save_labels
-from kcgs.data.shards import SceneBatch, SceneDataset, save_shard, shard_path, stack_scenes
+from .charts import ChartSample, chart_2x3, chart_pie
+from .colors import colorize_labels, label_colors, overlay_labels
+from .davis import Davis, DavisFrame
+from .images import load_image, save_image
+from .labels import load_labels, save_labels
+from .shards import SceneBatch, SceneDataset, save_shard, shard_path, stack_scenes
 
 # public; what else is imported here is for the other rooms of kcgs
 __all__ = [

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from kcgs.errors import InvalidArgument
-from kcgs.functional import RegionMap
+from kcgs.functional import RegionMap, to_tokens
 from kcgs.nn import GaussianField, pad_rows
 from kcgs.scene import Scene
 from kcgs.storage import MappedScene, map_file
@@ -23,10 +23,15 @@ _DIGITS = 5
 
 
 class SceneBatch(NamedTuple):
-    """Scenes of a data set as tensors; rows that an image has no use for have the colour 0."""
+    """Scenes of a data set as tensors.
+
+    Rows are in the order of :func:`kcgs.fitting.rank_gaussians`; those that an image has no use for have the colour 0.
+    """
 
     positions: Tensor
     """Of the scenes in the data set, (B,) int64."""
+    sizes: Tensor
+    """(height, width) of the images, (B, 2) int64."""
     means: Tensor
     """(B, N, 2)"""
     cholesky: Tensor
@@ -35,6 +40,10 @@ class SceneBatch(NamedTuple):
     """(B, N, C)"""
     region_ids: Tensor | None
     """(B, N) int64, where scenes have label maps."""
+
+    def tokens(self) -> Tensor:
+        """Write the Gaussians as numbers of order one, (B, N, 5 + C): see :func:`kcgs.functional.to_tokens`."""
+        return to_tokens(self.means, self.cholesky, self.colors, self.sizes)
 
 
 class SceneDataset(Dataset[Scene]):
@@ -110,8 +119,9 @@ class SceneDataset(Dataset[Scene]):
                     part = tensor.index_select(0, rows[chosen])
                     tables.setdefault(name, part.new_empty(len(positions), *part.shape[1:]))[chosen] = part
         ids = tables.get("region_ids")
+        sizes = torch.tensor([self._shard(number).size for number in numbers.tolist()]).view(-1, 2)
         return SceneBatch(
-            positions, tables["means"], tables["cholesky"], tables["colors"], None if ids is None else ids.long()
+            positions, sizes, tables["means"], tables["cholesky"], tables["colors"], None if ids is None else ids.long()
         )
 
     @staticmethod

@@ -7,6 +7,7 @@ from .initial import initial_field
 from .loop import describe_excess, fit, fit_problem, precompile
 from .problem import Problem, make_problem
 from .pursuit import propose_for, propose_gaussians
+from .ranking import rank_gaussians
 from .region_report import RegionReport, report_regions
 from .removal import lowest_impact, lowest_weighted_impact
 from .result import FitResult, HistoryEntry
@@ -16,5 +17,5 @@ from .user_objects import Densifier
 # public; what else is imported here is for the other rooms of kcgs
 __all__ = [
     "Densifier", "FitConfig", "FitResult", "FitState", "HistoryEntry", "RegionReport", "available_recipes", "fit",
-    "initial_field", "lowest_impact", "precompile", "propose_gaussians",
+    "initial_field", "lowest_impact", "precompile", "propose_gaussians", "rank_gaussians",
 ]  # fmt: skip

@@ -51,6 +51,15 @@ def lowest_impact(
         >>> int(mask.sum()), colors.shape
         (5, torch.Size([20, 3]))
     """
+    gaussians, renderer = check_gaussians(field, regions, backend)
+    count = check_count("num_gaussians", num_gaussians, 0, field.num_gaussians)
+    return lowest_weighted_impact(renderer, gaussians, count, torch.ones_like(gaussians.means[..., 0]))
+
+
+def check_gaussians(
+    field: GaussianField, regions: RegionMap | Tensor | None, backend: str
+) -> tuple[Gaussians, Renderer]:
+    """Return the Gaussians of a field without opacities, and a renderer with the map that confines them."""
     if not isinstance(field, GaussianField):
         raise InvalidArgumentType("field", "a GaussianField", type(field).__name__)
     if field.opacities is not None:
@@ -58,9 +67,7 @@ def lowest_impact(
     map_of_field = regions_of(field.size, regions, field.means.shape[0] if field.means.ndim == 3 else None)
     if (map_of_field is None) != (field.region_ids is None):
         raise InvalidArgument("regions", "given where the field has region ids, and only there", regions)
-    count = check_count("num_gaussians", num_gaussians, 0, field.num_gaussians)
-    gaussians, renderer = Gaussians.of(field), Renderer(field.size, map_of_field, backend=check_backend(backend))
-    return lowest_weighted_impact(renderer, gaussians, count, torch.ones_like(gaussians.means[..., 0]))
+    return Gaussians.of(field), Renderer(field.size, map_of_field, backend=check_backend(backend))
 
 
 @torch.no_grad()

@@ -29,10 +29,11 @@ from .metrics import (
     window_taps,
 )
 from .splat import region_splat, splat_at
+from .tokens import NUM_GEOMETRY, from_tokens, to_tokens
 
 # public; what else is imported here is for the other rooms of kcgs
 __all__ = [
     "PairSoftness", "RegionMap", "activate_gaussians", "cholesky_to_covariance", "cholesky_to_scale_rotation",
-    "choose_softness", "covariance_to_cholesky", "edge_band", "ef_psnr", "ef_ssim", "lookup_regions", "merge_regions",
-    "ms_ssim", "psnr", "region_splat", "scale_rotation_to_cholesky", "ssim",
+    "choose_softness", "covariance_to_cholesky", "edge_band", "ef_psnr", "ef_ssim", "from_tokens", "lookup_regions",
+    "merge_regions", "ms_ssim", "psnr", "region_splat", "scale_rotation_to_cholesky", "ssim", "to_tokens",
 ]  # fmt: skip

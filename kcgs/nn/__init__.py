@@ -1,7 +1,8 @@
 """Modules: a set of Gaussians, and the renderer that renders it."""
 
-from .field import GaussianField, join, pad_rows, scaled_gaussians
+from .field import GaussianField
 from .renderer import RegionSplatRenderer, area_mean, rendered_size
+from .rows import join, pad_rows, reorder_rows, scaled_gaussians
 
 # public; what else is imported here is for the other rooms of kcgs
 __all__ = ["GaussianField", "RegionSplatRenderer"]

@@ -7,7 +7,6 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import pad
 
 from kcgs._check import (
     check_count,
@@ -20,10 +19,9 @@ from kcgs._check import (
     check_tensor,
 )
 from kcgs._labels import check_labels
-from kcgs._sizes import is_equal
 from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument, InvalidArgumentType
-from kcgs.functional import RegionMap, check_cholesky, lookup_regions
+from kcgs.functional import NUM_GEOMETRY, RegionMap, check_cholesky, from_tokens, lookup_regions, to_tokens
 
 _HALF = (torch.float16, torch.bfloat16)
 
@@ -244,6 +242,69 @@ class GaussianField(nn.Module):
         parts = (None if tensor is None else tensor.detach()[index] for tensor in tensors)
         return GaussianField(*parts, size=self.size)  # type: ignore[arg-type]
 
+    def tokens(self) -> Tensor:
+        r"""Write the Gaussians as numbers of order one, for a network; opacities are multiplied into the colours.
+
+        :func:`kcgs.functional.to_tokens` has the columns. Ids are beside them, in `region_ids`.
+
+        Returns:
+            :math:`(N, 5 + C)` or :math:`(B, N, 5 + C)`, with the graph.
+
+        Example:
+            >>> field = GaussianField.random(10, (32, 48), seed=0)
+            >>> twin = GaussianField.from_tokens(field.tokens(), size=field.size)
+            >>> field.tokens().shape, torch.allclose(twin.cholesky, field.cholesky)
+            (torch.Size([10, 8]), True)
+        """
+        return to_tokens(self.means, self.cholesky, self.merged_colors(), self.size)
+
+    @classmethod
+    def from_tokens(cls, tokens: Tensor, region_ids: Tensor | None = None, *, size: tuple[int, int]) -> GaussianField:
+        """Make a field of the tokens that :meth:`tokens` writes, differentiably.
+
+        Args:
+            tokens: floating, :math:`(N, 5 + C)` or :math:`(B, N, 5 + C)`, such as a network's output.
+            region_ids: integer, :math:`(N)` or :math:`(B, N)`; None: not confined.
+            size: (height, width) of the image.
+
+        Raises:
+            TypeError, ValueError: as the field; fewer than 6 columns.
+        """
+        check_floating("tokens", tokens, dims=(2, 3))
+        if tokens.shape[-1] <= NUM_GEOMETRY:
+            raise InvalidArgument("tokens", "5 + C columns", tuple(tokens.shape), verb="have")
+        return cls(*from_tokens(tokens, check_size("size", size)), region_ids, size=size)
+
+    def hflip(self) -> GaussianField:
+        """Return the field of the image that is flipped left to right, exactly, with the graph.
+
+        A label map is flipped by ``labels.flip(-1)``.
+
+        Example:
+            >>> from kcgs import Scene
+            >>> field = GaussianField.random(10, (32, 48), seed=0)
+            >>> torch.allclose(Scene(field.hflip())(), Scene(field)().flip(-1), atol=1e-5)
+            True
+        """
+        return self._mirrored(0)
+
+    def vflip(self) -> GaussianField:
+        """Return the field of the image that is flipped upside down, exactly, with the graph."""
+        return self._mirrored(1)
+
+    def shift(self, x: float, y: float) -> GaussianField:
+        """Return the field moved by so many pixels to the right and down, with the graph."""
+        means = self.means + self.means.new_tensor([x, y])
+        return GaussianField(means, self.cholesky, self.colors, self.region_ids, self.opacities, size=self.size)
+
+    def _mirrored(self, axis: int) -> GaussianField:
+        """Mirror x (0) or y (1): a covariance keeps its variances, and the sign of its covariance changes."""
+        signs, offsets = self.means.new_ones(2), self.means.new_zeros(2)
+        signs[axis], offsets[axis] = -1.0, self.size[1 - axis]
+        cholesky = self.cholesky * self.cholesky.new_tensor([1.0, -1.0, 1.0])
+        means = offsets + signs * self.means
+        return GaussianField(means, cholesky, self.colors, self.region_ids, self.opacities, size=self.size)
+
     def merged_colors(self) -> Tensor:
         """Colours with the opacities multiplied in, (N, C) or (B, N, C)."""
         return self.colors if self.opacities is None else self.colors * self.opacities[..., None]
@@ -292,49 +353,3 @@ def _describe(field: GaussianField) -> str:
 
 def _describe_rows(means: Tensor) -> str:
     return f"{' x '.join(map(str, means.shape[:-1]))} Gaussians"
-
-
-def scaled_gaussians(field: GaussianField, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Return means and Cholesky factors as they are on an image of another size, with the graph."""
-    means, cholesky = field.means, field.cholesky
-    if is_equal(size[0], field.size[0]) and is_equal(size[1], field.size[1]):
-        return means, cholesky
-    # a graph of any size takes its sides as tensors only
-    factors = torch.stack([torch.full((), size[k], dtype=torch.float64) / field.size[k] for k in (1, 0)]).to(means)
-    return means * factors, cholesky * factors[[0, 1, 1]]
-
-
-def join(first: GaussianField, second: GaussianField) -> GaussianField:
-    """Put two fields, both with region ids or neither, into one without the graph; no opacity is 1."""
-    rows = first.means.ndim - 2
-
-    def concatenate(a: Tensor, b: Tensor) -> Tensor:
-        return torch.cat([a.detach(), b.detach()], rows)
-
-    ids = opacities = None
-    if first.region_ids is not None and second.region_ids is not None:
-        ids = concatenate(first.region_ids, second.region_ids)
-    if first.opacities is not None or second.opacities is not None:
-        opaque = (f.means.new_ones(f.means.shape[:-1]) if f.opacities is None else f.opacities for f in (first, second))
-        opacities = concatenate(*opaque)
-    means, cholesky = concatenate(first.means, second.means), concatenate(first.cholesky, second.cholesky)
-    return GaussianField(means, cholesky, concatenate(first.colors, second.colors), ids, opacities, size=first.size)
-
-
-def pad_rows(field: GaussianField, count: int, regions: RegionMap | None = None) -> GaussianField:
-    """Return a field without opacities with rows of the colour 0 up to a number for each image, and without the graph.
-
-    The rows are of the region of an image's first Gaussian, or with a map of its first region; with a map all Gaussians
-    of a field without ids are, too.
-    """
-    missing, ids = count - field.num_gaussians, field.region_ids
-    means, cholesky, colors = (
-        pad(table.detach(), (0, 0, 0, missing), value=fill)
-        for table, fill in ((field.means, 1.0), (field.cholesky, 1.0), (field.colors, 0.0))
-    )
-    if regions is not None and ids is None:
-        ids = regions.ids[:1].expand(means.shape[:-1])
-    elif ids is not None:
-        first = ids[..., :1] if regions is None else regions.ids[:1]
-        ids = torch.cat([ids, first.expand(*ids.shape[:-1], missing)], -1)
-    return GaussianField(means, cholesky, colors, ids, size=field.size)

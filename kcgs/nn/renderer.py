@@ -12,7 +12,8 @@ from kcgs._sizes import is_equal
 from kcgs.functional import RegionMap, splat_at
 from kcgs.maps import table_and_size
 
-from .field import GaussianField, scaled_gaussians
+from .field import GaussianField
+from .rows import scaled_gaussians
 
 
 class SceneLike(Protocol):

@@ -86,5 +86,5 @@ class NewtonDescent:
 
 
 def self_product(cholesky: Tensor) -> Tensor:
-    """Return the sum of each Gaussian's squared weights over pixel centres, (N,)."""
-    return math.pi * cholesky[:, ::2].clamp_min(_MIN_SIGMA).prod(-1)
+    """Return the sum of each Gaussian's squared weights over pixel centres, (..., N)."""
+    return math.pi * cholesky[..., ::2].clamp_min(_MIN_SIGMA).prod(-1)

@@ -20,6 +20,7 @@ from PIL import Image
 from kcgs import load
 from kcgs.cli import many_jobs, many_shards
 from kcgs.data import SceneDataset, save_image, save_labels
+from kcgs.fitting import rank_gaussians
 from tests.cli.conftest import Kcgs, Run
 
 FIT = ("-n", "12", "--iterations", "3", "--workers", "1", "-o", "out")
@@ -312,7 +313,7 @@ class TestShards:
         assert dataset.names == ["a.png", "b.png", "c.png"]
         for index, stem in enumerate("abc"):
             scene, alone = dataset[index], load(f"alone/{stem}.safetensors")
-            assert torch.equal(scene.field.means, alone.field.means)
+            assert torch.equal(scene.field.means, alone.field.means[rank_gaussians(alone.field)])
             assert float(rows()[stem]["psnr"]) == float(dataset.psnr[index])
         assert dataset.__getitems__([0, 2]).means.shape == (2, 12, 2)
 

@@ -1,0 +1,53 @@
+"""Gaussians as numbers of order one, for networks."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+# columns of a token besides the colours
+NUM_GEOMETRY = 5
+
+
+def to_tokens(means: Tensor, cholesky: Tensor, colors: Tensor, size: tuple[int, int] | Tensor) -> Tensor:
+    r"""Write Gaussians as tokens; :func:`from_tokens` is the inverse, to rounding.
+
+    Convention: a token is :math:`(2x/w - 1, 2y/h - 1, \ln(l_{11}/s), l_{21}/(l_{11} + l_{22}), \ln(l_{22}/s), c)` with
+    :math:`s = \sqrt{hw}`. Centres in the image are in [-1, 1]; a fit lets them lie a little outside.
+
+    Args:
+        means: (x, y) in pixels, :math:`(..., N, 2)`.
+        cholesky: (l11, l21, l22) in pixels, :math:`(..., N, 3)`.
+        colors: with opacities multiplied in, :math:`(..., N, C)`.
+        size: (height, width) of the image, or of each image, :math:`(..., 2)`.
+
+    Returns:
+        :math:`(..., N, 5 + C)`, with the graph.
+
+    Example:
+        >>> means, cholesky = torch.tensor([[12.0, 8.0]]), torch.tensor([[2.0, 1.0, 2.0]])
+        >>> to_tokens(means, cholesky, torch.tensor([[0.5]]), (16, 24))
+        tensor([[ 0.0000,  0.0000, -2.2822,  0.2500, -2.2822,  0.5000]])
+    """
+    extent, side = _extent(means, size)
+    l11, l21, l22 = cholesky.unbind(-1)
+    shape = torch.stack([torch.log(l11 / side), l21 / (l11 + l22), torch.log(l22 / side)], -1)
+    return torch.cat([2.0 * means / extent - 1.0, shape, colors], -1)
+
+
+def from_tokens(tokens: Tensor, size: tuple[int, int] | Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    r"""Read means, factors and colours from tokens, :math:`(..., N, 5 + C)`, with the graph: see :func:`to_tokens`.
+
+    Any finite numbers give valid Gaussians, as long as the exponentials do not overflow.
+    """
+    extent, side = _extent(tokens, size)
+    x, y, log11, slant, log22 = tokens[..., :NUM_GEOMETRY].unbind(-1)
+    l11, l22 = torch.exp(log11) * side, torch.exp(log22) * side
+    means = 0.5 * (torch.stack([x, y], -1) + 1.0) * extent
+    return means, torch.stack([l11, slant * (l11 + l22), l22], -1), tokens[..., NUM_GEOMETRY:]
+
+
+def _extent(table: Tensor, size: tuple[int, int] | Tensor) -> tuple[Tensor, Tensor]:
+    """Return (width, height) and the root of the area, in the shapes of tables (..., N, K) and of their columns."""
+    sizes = torch.as_tensor(size, dtype=table.dtype, device=table.device).unsqueeze(-2)
+    return sizes.flip(-1), sizes.prod(-1).sqrt()
