@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from kcgs import FitConfig, fit
+from kcgs.fitting import precompile
 
 from .core.clocks import peak_megabytes, threads
 from .core.compare import group_by, means_table
@@ -98,6 +99,7 @@ def measure(image: str, method: str, batches: list[int], data: str, quick: bool)
     seconds: dict[int, list[float]] = {batch: [] for batch in batches}
     psnrs: dict[int, Tensor] = {}
     with threads(1 if method == CORE else os.cpu_count() or 1):
+        precompile(config, device)
         for _ in range(1 if quick or image == KODAK else ROUNDS + 1):  # the first compiles
             for batch in batches:
                 start = time.perf_counter()
