@@ -84,6 +84,12 @@ class MappedScene:
         self.size: tuple[int, int] = height, width
         self.metadata: dict[str, str] = header["notes"]
 
+    @property
+    def layout(self) -> str:
+        """What all shards of a data set have in common, in words."""
+        _, rows, channels = self.tensors["colors"].shape
+        return f"{rows} rows, {channels} channels, {'' if 'region_ids' in self.tensors else 'no '}regions"
+
     @cached_property
     def _regions(self) -> RegionMap | None:
         """The label maps, which are compressed as one: all are read at once."""

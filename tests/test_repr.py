@@ -17,7 +17,7 @@ from PIL import Image
 
 import kcgs
 from kcgs import FitConfig, GaussianField, RegionMap, RegionSplatRenderer, Scene, codec, fit, prune
-from kcgs.data import ChartSample, Davis, DavisFrame, save_image, save_labels
+from kcgs.data import ChartSample, Davis, DavisFrame, SceneDataset, save_image, save_labels, save_shard
 from kcgs.fitting import FitResult, available_recipes
 from kcgs.fitting.events import Densify
 from kcgs.fitting.problem import make_problem
@@ -54,6 +54,11 @@ def objects(result: FitResult, folder: Path) -> Iterator[Any]:
     yield from (codec.decode(data), Compressed(data, scene), FitBytesResult(data, scene, result), prune(result.scene))
     yield from (Segmentation(LABELS, torch.rand(21), {i: f"name {i}" for i in range(21)}), Cleanup())
     yield from (Prediction(LABELS.numpy(), torch.rand(SIZE), [f"name {i}" for i in range(21)]), *entries())
+    folder.mkdir(exist_ok=True)
+    batch = Scene(GaussianField.stack([field] * 3), LABELS.expand(3, -1, -1))
+    save_shard(folder / "00000.safetensors", batch, ["a long name " * 9] * 3, [30.0] * 3)
+    dataset = SceneDataset(folder)
+    yield from (dataset, dataset.__getitems__([0, 2]))
     yield from (ChartSample(image, LABELS), DavisFrame("bear", image, LABELS))
     for kind in ("JPEGImages", "Annotations"):
         (folder / kind / "480p" / "bear").mkdir(parents=True)

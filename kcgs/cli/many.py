@@ -19,7 +19,7 @@ from kcgs.errors import InvalidArgument
 from . import options
 from .commands import app
 from .common import INTERRUPTED, Json, Quiet, print_report
-from .many_batches import complete_shards, count_done, make_batches, run_batch, takes_one_image
+from .many_batches import check_shards, complete_shards, count_done, make_batches, run_batch, takes_one_image
 from .many_jobs import FitJob, Outcome
 
 
@@ -48,7 +48,10 @@ def fit_many_command(
         Literal["local", "ray"],
         typer.Option(help="local: processes of this machine; ray: the cluster at RAY_ADDRESS, or one started here."),
     ] = "local",
-    workers: Annotated[int | None, typer.Option(min=1, help="Images at a time; default: cores / --threads.")] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, help="Batches at a time; default: cores / --threads, with --device cuda two per GPU."),
+    ] = None,
     threads: Annotated[int, typer.Option(min=1, help="Threads of each fit.")] = 1,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace files made with other settings or changed since.")
@@ -108,6 +111,7 @@ def fit_many_command(
         workers = 2 * len(devices) if on_gpu else max(1, _count_cores() // threads)
     batches = make_batches(jobs, "1" if single else batch, shard, workers or 1, devices, output)
     workers = None if workers is None else min(workers, len(batches))
+    check_shards(batches)
     outcomes = dict[int, Outcome]()
     try:
         with Progress("fit-many", visible=not quiet) as progress:
@@ -130,7 +134,7 @@ def fit_many_command(
             _write_table(output / "results.csv", rows)
     failures = [row for row in rows if "error" in row]
     misses = [row for row in rows if row.get("target_reached") is False]
-    num_kept = sum(not outcome.is_new for outcome in outcomes.values())
+    num_kept = sum(not outcome.is_new and "error" not in outcome.row for outcome in outcomes.values())
     counts = {
         "images": len(rows), "fitted": len(rows) - len(failures) - num_kept, "kept": num_kept,
         "failed": len(failures), "missed": len(misses),
@@ -209,4 +213,6 @@ def _means(rows: list[dict[str, Any]]) -> dict[str, float]:
         values = [row[name] for row in rows if row.get(name) is not None]
         if values:
             means[f"mean_{name}"] = statistics.fmean(values)
+        if values and name == "psnr":
+            means["median_psnr"] = statistics.median(values)
     return means

@@ -80,14 +80,23 @@ def make_batches(
     return batches
 
 
+def check_shards(batches: Sequence[Batch]) -> None:
+    """Refuse shards that are there from other images or with other settings, before any work."""
+    for batch in batches:
+        if isinstance(batch.work, ShardPart):
+            batch.work.check()
+
+
 def complete_shards(batches: Sequence[Batch], number: int, outcomes: Mapping[int, Outcome]) -> None:
     """Write the shard of the batch that was done last, once all its parts are."""
     work = batches[number].work
     if not isinstance(work, ShardPart):
         return
-    same = [b for b in batches if isinstance(b.work, ShardPart) and b.work.shard == work.shard]
-    if all(index in outcomes for batch in same for index in batch.indices):
-        complete_shard([batch.work for batch in same if isinstance(batch.work, ShardPart)])
+    same = [(b.work, b.indices) for b in batches if isinstance(b.work, ShardPart) and b.work.shard == work.shard]
+    images = {index: job.image.name for part, indices in same for index, job in zip(indices, part.images, strict=True)}
+    if images.keys() <= outcomes.keys():
+        rows = {name: outcomes[index].row for index, name in images.items()}
+        complete_shard([part for part, _ in same], {name: row["error"] for name, row in rows.items() if "error" in row})
 
 
 def _by_size(jobs: Sequence[FitJob]) -> dict[Size | None, list[int]]:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from .common import describe_error
+from .common import describe_error, replace_undefined
 from .many_jobs import FitJob, Loaded, Outcome, describe_settings, fit_batch, load_job
 
 
@@ -26,8 +27,17 @@ class ShardPart(NamedTuple):
 
     @property
     def path(self) -> Path:
-        """The file of the part."""
-        return self.shard.with_name(f"{self.shard.stem}.part{self.number:04d}.safetensors")
+        """The file of the part, in a folder beside the shard."""
+        from kcgs.data import shard_path
+
+        return shard_path(self.shard.with_suffix(".parts"), self.number)
+
+    def check(self) -> None:
+        """Refuse a shard that is there from other images or with other settings, unless it may be replaced."""
+        is_kept = self.shard.is_file() and not self.images[0].overwrite
+        if is_kept and _notes(self.shard).get("fingerprint") != self.fingerprint:
+            problem = "is damaged, or was made from other images or with other settings"
+            raise FileExistsError(f"{self.shard} {problem}; --overwrite replaces such shards")
 
     def is_done(self) -> bool:
         """Whether the scenes of the part are on disk."""
@@ -77,17 +87,20 @@ def _fit_and_save(part: ShardPart, loaded: dict[int, Loaded], errors: dict[int, 
         fits = fit_batch([*loaded.values()], request)
     except Exception as error:  # of all of them: their images and maps were read
         return {index: Outcome({"error": describe_error(error)}, True) for index in loaded}
-    scenes = stack_scenes([fit.result.scene for fit in fits], request.num_gaussians)
+    with_maps = part.images[0].regions != "none"
+    scenes = stack_scenes([fit.result.scene for fit in fits], request.num_gaussians, with_maps=with_maps)
     field = reorder_rows(scenes.field, rank_gaussians(scenes.field, scenes.regions))
     scenes = Scene(field, scenes.regions).to("cpu")
     names = [part.images[index].image.name for index in loaded]
     psnr = [float(fit.result.psnr) for fit in fits]
     rows = [
-        {"psnr": fit.result.psnr, "num_gaussians": fit.result.scene.num_gaussians, "seconds": fit.seconds}
+        {"psnr": float(fit.result.psnr), "num_gaussians": fit.result.scene.num_gaussians, "seconds": fit.seconds}
         for fit in fits
     ]
+    rows = [replace_undefined(row) for row in rows]
     failed = {part.images[index].image.name: error for index, error in errors.items()}
     notes = {"fingerprint": part.fingerprint, "rows": json.dumps(rows), "errors": json.dumps(failed)}
+    part.path.parent.mkdir(exist_ok=True)
     save_shard(part.path, scenes, names, psnr, notes)
     return {
         index: Outcome(row, True, (*one.warnings, *fit.warnings))
@@ -97,14 +110,9 @@ def _fit_and_save(part: ShardPart, loaded: dict[int, Loaded], errors: dict[int, 
 
 def _read_kept(part: ShardPart, path: Path) -> list[Outcome] | None:
     """Return the rows of a part that are in a file of the same images and settings; None: it is not there."""
-    if not path.is_file():
-        return None
     notes = _notes(path)
     if notes.get("fingerprint") != part.fingerprint:
-        if part.images[0].overwrite:
-            return None
-        problem = "made from other images or with other settings"
-        return [Outcome({"error": f"{path} exists, {problem}; --overwrite replaces it"}, True)] * len(part.images)
+        return None
     rows: dict[str, dict[str, Any]] = dict(zip(json.loads(notes["names"]), json.loads(notes["rows"]), strict=True))
     rows |= {name: {"error": error} for name, error in json.loads(notes["errors"]).items()}
     return [Outcome(rows[job.image.name], False) for job in part.images]
@@ -120,8 +128,13 @@ def _notes(path: Path) -> dict[str, str]:
         return {}
 
 
-def complete_shard(parts: Sequence[ShardPart]) -> None:
-    """Write a shard from its parts, and remove these; nothing where the shard is there, or no image was fitted."""
+def complete_shard(parts: Sequence[ShardPart], errors: Mapping[str, str]) -> None:
+    """Write a shard from its parts, and remove these; nothing where the shard is there, or no image was fitted.
+
+    Args:
+        parts: all of the shard.
+        errors: of images that failed, by name.
+    """
     from kcgs.data import save_shard, stack_scenes
     from kcgs.files import load
 
@@ -129,15 +142,16 @@ def complete_shard(parts: Sequence[ShardPart]) -> None:
     if not scenes:
         return
     names, psnr, rows = [], [], []
-    errors: dict[str, str] = {}
     for scene in scenes:
         notes = scene.metadata
         names += json.loads(notes["names"])
-        psnr += json.loads(notes["psnr"])
+        psnr += [math.inf if number is None else number for number in json.loads(notes["psnr"])]
         rows += json.loads(notes["rows"])
-        errors |= json.loads(notes["errors"])
     notes = {"fingerprint": parts[0].fingerprint, "rows": json.dumps(rows), "errors": json.dumps(errors)}
-    joined = stack_scenes([one for scene in scenes for one in scene], scenes[0].num_gaussians)
+    singles = [one for scene in scenes for one in scene]
+    with_maps = scenes[0].regions is not None
+    joined = stack_scenes(singles, scenes[0].num_gaussians, with_maps=with_maps)
     save_shard(parts[0].shard, joined, names, psnr, notes)
     for part in parts:
         part.path.unlink(missing_ok=True)
+    parts[0].path.parent.rmdir()

@@ -96,6 +96,10 @@ def fit_request(
         bool,
         typer.Option("--keep-contours", help="Keep the label map: no contour moves, no region is merged."),
     ] = False,
+    min_sigma: Annotated[
+        float | None,
+        typer.Option(help="Least standard deviation of a Gaussian in pixels: more is softer, and has no stray lines."),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the random start.")] = 0,
     device: Annotated[str, typer.Option(help="Where to fit: cpu, or cuda for a GPU.")] = "cpu",
 ) -> FitRequest:
@@ -104,6 +108,7 @@ def fit_request(
         exclude("--target-bytes", num_gaussians=num_gaussians, target_psnr=target_psnr)
     settings: dict[str, Any] = {
         "iterations": iterations, "objective": objective, "max_seconds": max_seconds, "target_psnr": target_psnr,
+        "min_sigma": min_sigma,
     }  # fmt: skip
     settings = {key: value for key, value in settings.items() if value is not None}
     if keep_contours:

@@ -11,6 +11,7 @@ import typer
 
 from kcgs._atomic import write_file
 from kcgs._progress import Progress
+from kcgs._repr import shorten
 from kcgs._suffixes import SCENES, VIDEOS, WRITTEN_IMAGES
 
 from .commands import app
@@ -126,7 +127,7 @@ def info(scene: SceneFile, as_json: Json = False) -> None:
         "width": loaded.size[1],
         "softness": sum(means) / len(means),
         **describe_file(scene, scene.stat().st_size, loaded.size),
-        **{f"metadata.{key}": value for key, value in loaded.metadata.items()},
+        **{f"metadata.{key}": value if as_json else shorten(value) for key, value in loaded.metadata.items()},
     }
     if loaded.regions is not None and loaded.field.means.ndim == 2:
         table = _describe_regions(loaded)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import operator
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from kcgs._repr import brief
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap, to_tokens
 from kcgs.nn import GaussianField, pad_rows
@@ -22,10 +25,12 @@ from kcgs.storage import MappedScene, map_file
 _DIGITS = 5
 
 
+@brief
 class SceneBatch(NamedTuple):
-    """Scenes of a data set as tensors.
+    """Scenes of a data set as tensors; rows that an image has no use for have the colour 0.
 
-    Rows are in the order of :func:`kcgs.fitting.rank_gaussians`; those that an image has no use for have the colour 0.
+    In shards of `kcgs fit-many` rows are in the order of :func:`kcgs.fitting.rank_gaussians`. Label maps are those of
+    ``dataset[k].regions``.
     """
 
     positions: Tensor
@@ -40,6 +45,10 @@ class SceneBatch(NamedTuple):
     """(B, N, C)"""
     region_ids: Tensor | None
     """(B, N) int64, where scenes have label maps."""
+
+    def to(self, device: torch.device | str) -> SceneBatch:
+        """Return the batch on another device."""
+        return SceneBatch(*(None if table is None else table.to(device) for table in self))  # type: ignore[arg-type]
 
     def tokens(self) -> Tensor:
         """Write the Gaussians as numbers of order one, (B, N, 5 + C): see :func:`kcgs.functional.to_tokens`."""
@@ -91,9 +100,13 @@ class SceneDataset(Dataset[Scene]):
             psnrs += psnr
         self.psnr = torch.tensor(psnrs, dtype=torch.float64)
         self._firsts = torch.tensor([0, *counts]).cumsum(0)
-        layouts = {tuple(self._shard(k).tensors["colors"].shape[1:]): path for k, path in enumerate(self._paths)}
+        layouts = {self._shard(number).layout: path.name for number, path in enumerate(self._paths)}
         if len(layouts) > 1:
-            raise InvalidArgument("folder", "shards of as many rows and channels", layouts, verb="hold")
+            expected = "shards of as many rows and channels, all with regions or none"
+            raise InvalidArgument("folder", expected, layouts, verb="hold")
+
+    def __repr__(self) -> str:
+        return f"SceneDataset({len(self)} scenes in {len(self._paths)} shards, {self._shard(0).layout})"
 
     def __len__(self) -> int:
         """Return the number of scenes."""
@@ -101,14 +114,14 @@ class SceneDataset(Dataset[Scene]):
 
     def __getitem__(self, index: int) -> Scene:
         """Return a scene, without rows of the colour 0."""
-        position = range(len(self))[index]
+        position = range(len(self))[operator.index(index)]
         number = int(torch.searchsorted(self._firsts, position, right=True)) - 1
         shard, row = self._shard(number), position - int(self._firsts[number])
         return shard.scene(row)
 
     def __getitems__(self, indices: Sequence[int]) -> SceneBatch:
         """Return scenes as tensors, in the order of the indices; a DataLoader calls this."""
-        positions = torch.as_tensor(indices, dtype=torch.int64)
+        positions = torch.tensor([range(len(self))[operator.index(index)] for index in indices])
         numbers = torch.searchsorted(self._firsts, positions, right=True) - 1
         rows = positions - self._firsts[numbers]
         tables: dict[str, Tensor] = {}
@@ -142,8 +155,11 @@ class SceneDataset(Dataset[Scene]):
 
 def list_shards(folder: str | os.PathLike[str]) -> list[Path]:
     """List the shards of a folder, in order."""
-    files = Path(folder).glob("*.safetensors")
-    return sorted(path for path in files if path.stem.isdigit() and len(path.stem) >= _DIGITS)
+    return sorted(path for path in Path(folder).glob("*.safetensors") if _is_shard(path))
+
+
+def _is_shard(path: Path) -> bool:
+    return path.suffix == ".safetensors" and path.stem.isdigit() and len(path.stem) >= _DIGITS
 
 
 def shard_path(folder: Path, number: int) -> Path:
@@ -155,13 +171,20 @@ def save_shard(
     path: str | os.PathLike[str],
     scenes: Scene,
     names: Sequence[str],
-    psnr: Sequence[float],
+    psnr: Sequence[float] | Tensor,
     metadata: Mapping[str, str] | None = None,
 ) -> int:
-    """Write a batch of scenes with the names and the PSNR of its images, in the metadata; return the bytes.
+    """Write a batch of scenes as a shard, with the names and the PSNR of its images; return the bytes.
+
+    Args:
+        path: 00000.safetensors, 00001.safetensors and so on.
+        scenes: of images of one size.
+        names: of the images.
+        psnr: of the scenes, in dB, such as that of :class:`kcgs.FitResult`.
+        metadata: more notes, for the file.
 
     Raises:
-        ValueError: as many names or numbers as there are not scenes.
+        ValueError: another name; not as many names or numbers as scenes.
 
     Example:
         >>> import tempfile
@@ -170,29 +193,35 @@ def save_shard(
         ...     save_shard(f"{folder}/00000.safetensors", scenes, ["a", "b"], [30.0, 31.0]) > 600
         True
     """
-    for name, values in (("names", names), ("psnr", psnr)):
+    if not _is_shard(Path(path)):
+        raise InvalidArgument("path", "a name such as 00000.safetensors", repr(str(path)))
+    numbers: list[float] = torch.as_tensor(psnr).tolist()
+    for name, values in (("names", names), ("psnr", numbers)):
         if len(values) != len(scenes):
             raise InvalidArgument(name, f"one for each of {len(scenes)} scenes", len(values))
-    notes = {**(metadata or {}), "names": json.dumps([*names]), "psnr": json.dumps([*psnr])}
+    # JSON has no infinity, which the PSNR of an image without error is
+    finite = [number if math.isfinite(number) else None for number in numbers]
+    notes = {**(metadata or {}), "names": json.dumps([*names]), "psnr": json.dumps(finite)}
     return Scene(scenes.field, scenes.regions, notes).save(path)
 
 
 def shard_contents(metadata: Mapping[str, str], path: Path) -> tuple[list[str], list[float]]:
     """Return the names and the PSNR of the images of a shard."""
     try:
-        return json.loads(metadata["names"]), json.loads(metadata["psnr"])
+        psnr = [math.inf if number is None else number for number in json.loads(metadata["psnr"])]
+        return json.loads(metadata["names"]), psnr
     except (KeyError, ValueError):
         raise ValueError(f"{path} is no shard: its metadata lack names and psnr") from None
 
 
-def stack_scenes(scenes: Sequence[Scene], num_gaussians: int) -> Scene:
+def stack_scenes(scenes: Sequence[Scene], num_gaussians: int, *, with_maps: bool) -> Scene:
     """Put scenes of one image each, all of one size, into a batch of so many rows each, without opacities.
 
-    Where one has a label map, those without get a map of one region.
+    `with_maps`: a scene without a label map gets one of one region.
     """
-    maps = [scene.regions for scene in scenes]
-    if any(maps):
-        maps = [one or RegionMap(torch.zeros(scenes[0].size, dtype=torch.int64)) for one in maps]
+    if not with_maps:
+        return Scene(GaussianField.stack([pad_rows(scene.field, num_gaussians) for scene in scenes]))
+    one_region = torch.zeros(scenes[0].size, dtype=torch.int64, device=scenes[0].field.means.device)
+    maps = [scene.regions or RegionMap(one_region) for scene in scenes]
     fields = [pad_rows(scene.field, num_gaussians, one) for scene, one in zip(scenes, maps, strict=True)]
-    regions = RegionMap.stack([one for one in maps if one is not None]) if any(maps) else None
-    return Scene(GaussianField.stack(fields), regions)
+    return Scene(GaussianField.stack(fields), RegionMap.stack(maps))

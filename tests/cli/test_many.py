@@ -305,6 +305,8 @@ class TestShards:
         code, out, err = fit_many(*self.ARGUMENTS)
         report = json.loads(out)
         assert (code, report["images"], report["fitted"], report["failed"]) == (1, 4, 3, 1) and "d.png" in err
+        again = json.loads(fit_many(*self.ARGUMENTS).out)
+        assert [again[key] for key in ("fitted", "kept", "failed")] == [0, 3, 1]
         assert {path.name for path in Path("out").iterdir()} == {
             "00000.safetensors", "00001.safetensors", "results.csv"
         }  # fmt: skip
@@ -330,16 +332,17 @@ class TestShards:
         monkeypatch.setattr(many_shards, "fit_batch", interrupt)
         code, _, err = fit_many(*arguments)
         assert code == 130 and err.startswith("kcgs: interrupted: 1 of 3 images are done;"), err
-        assert [path.name for path in Path("out").glob("*.safetensors")] == ["00000.part0000.safetensors"]
+        assert [str(path) for path in Path("out").rglob("*.safetensors")] == ["out/00000.parts/00000.safetensors"]
         code, out, err = fit_many(*arguments)
         assert code == 0 and [json.loads(out)[key] for key in ("fitted", "kept")] == [2, 1], err
-        assert [path.name for path in Path("out").glob("*.safetensors")] == ["00000.safetensors"]
+        assert {path.name for path in Path("out").iterdir()} == {"00000.safetensors", "results.csv"}
         before = Path("out/00000.safetensors").read_bytes(), rows()
         code, out, _ = fit_many(*arguments)
         assert [json.loads(out)[key] for key in ("fitted", "kept")] == [0, 3]
         assert before == (Path("out/00000.safetensors").read_bytes(), rows())
-        code, out, err = fit_many(*arguments, "--seed", "1")
-        assert code == 1 and "00000.safetensors exists, made from other images or with other settings" in err
+        code, _, err = fit_many(*arguments, "--seed", "1")
+        assert code == 1 and "00000.safetensors is damaged, or was made from other images or with other settings" in err
+        assert rows() == before[1]
         assert json.loads(fit_many(*arguments, "--seed", "1", "--overwrite").out)["fitted"] == 3
 
     def test_maps_and_sizes(self, fit_many: Kcgs) -> None:

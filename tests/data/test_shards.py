@@ -42,7 +42,8 @@ def write(folder: Path, has_maps: bool = False) -> list[Scene]:
 @pytest.mark.parametrize("has_maps", [False, True])
 def test_an_index_gives_a_scene(has_maps: bool, tmp_path: Path) -> None:
     expected = write(tmp_path, has_maps)
-    Path(tmp_path / "00001.part0000.safetensors").write_bytes(b"")  # of a shard that is not complete
+    (tmp_path / "00002.parts").mkdir()  # of a shard that is not complete
+    (tmp_path / "00002.parts/00000.safetensors").write_bytes(b"")
     dataset = SceneDataset(tmp_path)
     assert (len(dataset), "".join(dataset.names), dataset.psnr.tolist()) == (5, "abcde", [20, 21, 22, 20, 21])
     for index, scene in enumerate(expected):
@@ -106,7 +107,30 @@ def test_what_is_no_data_set(tmp_path: Path) -> None:
         SceneDataset(tmp_path)
     for number, rows in enumerate((9, 8)):
         save_shard(tmp_path / f"0000{number}.safetensors", scenes_of(2, num_gaussians=rows), "ab", [1.0, 2.0])
-    with pytest.raises(ValueError, match="folder must hold shards of as many rows and channels"):
+    with pytest.raises(ValueError, match="folder must hold shards of as many rows and channels, all with"):
         SceneDataset(tmp_path)
+    save_shard(tmp_path / "00001.safetensors", scenes_of(2, has_maps=True), "ab", [1.0, 2.0])
+    with pytest.raises(ValueError, match="9 rows, 3 channels, no regions.*9 rows, 3 channels, regions"):
+        SceneDataset(tmp_path)
+    with pytest.raises(ValueError, match=r"path must be a name such as 00000.safetensors; got '.*train.safetensors'"):
+        save_shard(tmp_path / "train.safetensors", scenes_of(2), "ab", [1.0, 2.0])
     with pytest.raises(ValueError, match="names must be one for each of 2 scenes; got 3"):
         save_shard(tmp_path / "00002.safetensors", scenes_of(2), "abc", [1.0, 2.0])
+
+
+def test_an_image_without_error(tmp_path: Path) -> None:
+    save_shard(tmp_path / "00000.safetensors", scenes_of(2), "ab", torch.tensor([20.0, torch.inf]))
+    assert SceneDataset(tmp_path).psnr.tolist() == [20.0, torch.inf]
+    assert load(tmp_path / "00000.safetensors").metadata["psnr"] == "[20.0, null]"
+
+
+def test_indices_and_devices(tmp_path: Path) -> None:
+    write(tmp_path)
+    dataset = SceneDataset(tmp_path)
+    assert repr(dataset) == "SceneDataset(5 scenes in 2 shards, 9 rows, 3 channels, no regions)"
+    batch = dataset.__getitems__([-1, 2]).to("cpu")
+    assert batch.positions.tolist() == [4, 2] and batch.region_ids is None
+    with pytest.raises(TypeError):
+        dataset[1:3]  # type: ignore[index]
+    with pytest.raises(IndexError):
+        dataset.__getitems__([7])

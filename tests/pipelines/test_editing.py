@@ -21,7 +21,7 @@ from kcgs.editing import (
     replace_background,
 )
 from kcgs.functional import region_splat
-from kcgs.nn.field import scaled_gaussians
+from kcgs.nn import scaled_gaussians
 from tests.tester import BaseTester
 
 SIZE = (48, 64)
