@@ -71,10 +71,25 @@ def onnx(
         _check_names(names, len(raw))
         return predict_labels(logits, image.shape[1:], names)
     _check_names(names, 2)
+    return _predict_saliency(raw, image, threshold)._replace(names=names)
+
+
+def saliency(
+    image: Tensor, model: str | os.PathLike[str], threshold: float, mean: Sequence[float], std: Sequence[float]
+) -> Prediction:
+    """Segment as `onnx` does by a network with an output of one channel."""
+    raw = _run(image, model, None, mean, std)
+    if len(raw) != 1 or not raw.is_floating_point():
+        raise ValueError(f"the output of {model} must be a saliency, (1, 1, h, w); got {tuple(raw.shape)}")
+    return _predict_saliency(raw, image, threshold)
+
+
+def _predict_saliency(raw: Tensor, image: Tensor, threshold: float) -> Prediction:
+    """Return label 1 where a saliency, (1, h, w), is above a threshold: see `onnx`."""
     low, high = raw.aminmax()
     if low >= 0 and high <= 1:
         raw = ((raw - low) / (high - low).clamp(min=_MIN_PROBABILITY)).logit(_MIN_PROBABILITY)
-    return predict_labels(raw, image.shape[1:], None, threshold)._replace(names=names)
+    return predict_labels(raw, image.shape[1:], None, threshold)
 
 
 @register("lseg")

@@ -1,0 +1,103 @@
+"""The main object of a photo, by a network that needs no prompt."""
+
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+from torch import Tensor
+
+from kcgs._check import check_number
+from kcgs.errors import InvalidArgument
+from kcgs.segment.cleanup import Cleanup, Prediction
+from kcgs.segment.methods.onnx import saliency
+from kcgs.segment.networks import IMAGENET_MEAN, IMAGENET_STD
+from kcgs.segment.registry import register
+
+_RELEASE = "https://github.com/danielgatis/rembg/releases/download/v0.0.0"
+# where rembg keeps its weights, too
+_FOLDER_VARIABLE = "U2NET_HOME"
+_FOLDER = "~/.u2net"
+
+Triple = tuple[float, float, float]
+
+
+class _Weights(NamedTuple):
+    """A network's file on the web, and the mean and deviation of its images in [0, 1]."""
+
+    file: str
+    md5: str
+    mean: Triple = IMAGENET_MEAN
+    std: Triple = IMAGENET_STD
+
+
+_WEIGHTS = {
+    "isnet-general-use": _Weights(
+        "isnet-general-use.onnx", "fc16ebd8b0c10d971d3513d564d01e29", (0.5, 0.5, 0.5), (1.0, 1.0, 1.0)
+    ),
+    "birefnet-general": _Weights("BiRefNet-general-epoch_244.onnx", "7a35a0141cbbc80de11d9c9a28f52697"),
+    "u2netp": _Weights("u2netp.onnx", "8e83ca70e441ab06c318d82300c84806"),
+}
+_DEFAULT = "isnet-general-use"
+
+
+@register("object", Cleanup(connected=False))
+def find_object(
+    image: Tensor, *, model: str | os.PathLike[str] = _DEFAULT, threshold: float = 0.5, pieces: bool = False
+) -> Prediction:
+    """Separate the main object of a photo from the rest, without a prompt.
+
+    The networks are ISNet (Qin et al., "Highly Accurate Dichotomous Image Segmentation", ECCV 2022), BiRefNet (Zheng et
+    al., CAAI AIR 2024) and U-2-Net's small one, as the project rembg publishes them in ONNX: 179 MB, 973 MB and 4.6 MB.
+    They are downloaded once, into ~/.u2net or the folder U2NET_HOME, where rembg keeps them, too. The names of regions
+    are "object" and "background".
+
+    Args:
+        image: as `segment` takes it, any size.
+        model: isnet-general-use, birefnet-general, u2netp, or an ONNX file of ISNet; :func:`onnx` takes other networks.
+        threshold: of the object's score, in [0, 1].
+        pieces: every connected piece of the object is a region of its own; False: all are one.
+
+    Raises:
+        ValueError: no such model, weights that cannot be had, or a file that is no such network.
+        ImportError: the package pooch is not installed.
+
+    Example:
+        ``segment(image, "object")``
+    """
+    check_number("threshold", threshold, 0, 1)
+    path, weights = _find_weights(model)
+    prediction = saliency(image, path, threshold, weights.mean, weights.std)
+    names = ["background", "object"]
+    if not pieces:
+        return prediction._replace(names=names)
+    from scipy import ndimage
+
+    labels, count = ndimage.label(prediction.labels.numpy())
+    return prediction._replace(labels=labels, names=[*names[:1], *names[1:] * count])
+
+
+def _find_weights(model: str | os.PathLike[str]) -> tuple[Path, _Weights]:
+    """Return the file of a network and its normalisation; download it where it is not there."""
+    if (weights := _WEIGHTS.get(str(model))) is None:
+        if Path(model).suffix != ".onnx":
+            raise InvalidArgument("model", f"one of {', '.join(_WEIGHTS)}, or an ONNX file", repr(str(model)))
+        return Path(model), _WEIGHTS[_DEFAULT]
+    folder = Path(os.environ.get(_FOLDER_VARIABLE, _FOLDER)).expanduser()
+    path, url = folder / weights.file, f"{_RELEASE}/{weights.file}"
+    if not path.is_file():
+        _download(url, path, weights.md5)
+    return path, weights
+
+
+def _download(url: str, path: Path, md5: str) -> None:
+    """Fetch weights, whole or not at all, with a progress bar on a terminal."""
+    try:
+        import pooch
+    except ImportError as error:
+        raise ImportError("the weights need the package pooch: pip install 'kcgs[object]'") from error
+    downloader = pooch.HTTPDownloader(progressbar=os.isatty(2), timeout=30)
+    try:
+        pooch.retrieve(url, f"md5:{md5}", path.name, path.parent, downloader=downloader)
+    except Exception as error:  # of requests, of the disk, or a wrong checksum
+        hint = f"download {url} to {path}, or pass model=FILE.onnx"
+        raise ValueError(f"cannot load the weights of {path.stem}: {type(error).__name__}; {hint}") from error

