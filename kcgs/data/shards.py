@@ -195,7 +195,7 @@ def save_shard(
     """
     if not _is_shard(Path(path)):
         raise InvalidArgument("path", "a name such as 00000.safetensors", repr(str(path)))
-    numbers: list[float] = torch.as_tensor(psnr).tolist()
+    numbers: list[float] = torch.as_tensor(psnr, dtype=torch.float64).tolist()
     for name, values in (("names", names), ("psnr", numbers)):
         if len(values) != len(scenes):
             raise InvalidArgument(name, f"one for each of {len(scenes)} scenes", len(values))
