@@ -11,7 +11,6 @@ import typer
 
 from kcgs._atomic import write_file
 from kcgs._progress import Progress
-from kcgs._repr import shorten
 from kcgs._suffixes import SCENES, VIDEOS, WRITTEN_IMAGES
 
 from .commands import app
@@ -110,6 +109,7 @@ def info(scene: SceneFile, as_json: Json = False) -> None:
     clicked.
     """
     from kcgs import load
+    from kcgs._repr import shorten
 
     if (labels := _read_map(scene)) is not None:
         print_report(_describe_map(scene, labels), as_json, str(scene))

@@ -10,12 +10,12 @@ import tarfile
 from pathlib import Path
 from typing import Any
 
-import pooch
 import pytest
 import skimage.data
 import torch
 
 from kcgs.segment import segment, segment_with_scores
+from kcgs.segment.methods import objects
 from tests.segment.checks import split_image
 from tests.segment.test_onnx import write_mixer
 
@@ -77,31 +77,43 @@ class TestObject:
 
 
 class TestWeights:
-    def test_are_downloaded_once(self, network: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        calls = []
+    @pytest.fixture
+    def downloads(self, network: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+        """The addresses of files that are downloaded, in whose place there is the network."""
+        addresses: list[str] = []
 
-        def retrieve(url: str, known_hash: str, name: str, folder: Path, downloader: Any) -> None:
-            calls.append((url.rpartition("/")[2], known_hash, name))
-            Path(folder).mkdir(parents=True)
-            shutil.copy(network, Path(folder, name))
+        def download(url: str, path: str, *, progress: bool) -> None:
+            addresses.append(url)
+            shutil.copy(network, path)
 
         monkeypatch.setenv("U2NET_HOME", str(tmp_path / "weights"))
-        monkeypatch.setattr(pooch, "retrieve", retrieve)
+        monkeypatch.setattr(torch.hub, "download_url_to_file", download)
+        return addresses
+
+    def test_are_downloaded_once(
+        self, downloads: list[str], network: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        checksum = hashlib.md5(network.read_bytes()).hexdigest()
+        weights = objects._WEIGHTS["isnet-general-use"]._replace(md5=checksum)
+        monkeypatch.setitem(objects._WEIGHTS, "isnet-general-use", weights)
         for _ in range(2):
             segment(split_image(24, 40, 25), "object")
-        assert calls == [("isnet-general-use.onnx", "md5:fc16ebd8b0c10d971d3513d564d01e29", "isnet-general-use.onnx")]
+        assert [url.rpartition("/")[2] for url in downloads] == ["isnet-general-use.onnx"]
+        assert [path.name for path in (tmp_path / "weights").iterdir()] == ["isnet-general-use.onnx"]
 
-    def test_that_cannot_be_had(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        def retrieve(*arguments: Any, **settings: Any) -> None:
-            raise ConnectionError("no route to host")
-
-        monkeypatch.setenv("U2NET_HOME", str(tmp_path))
-        monkeypatch.setattr(pooch, "retrieve", retrieve)
+    def test_of_another_checksum_are_not_kept(self, downloads: list[str], tmp_path: Path) -> None:
         words = (
-            r"cannot load the weights of isnet-general-use: ConnectionError; download https://\S+.onnx "
+            r"cannot load the weights of isnet-general-use: the file has another checksum; download https://\S+.onnx "
             r"to \S+isnet-general-use.onnx, or pass model=FILE.onnx"
         )
         with pytest.raises(ValueError, match=words):
+            segment(torch.rand(3, 24, 40), "object")
+        assert len(downloads) == 1 and not list((tmp_path / "weights").iterdir())
+
+    def test_that_cannot_be_had(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setenv("U2NET_HOME", str(tmp_path))
+        monkeypatch.setattr(objects, "_RELEASE", "http://localhost:9")
+        with pytest.raises(ValueError, match="cannot load the weights of isnet-general-use: .*refused"):
             segment(torch.rand(3, 24, 40), "object")
 
 

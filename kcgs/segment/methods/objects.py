@@ -1,11 +1,14 @@
 """The main object of a photo, by a network that needs no prompt."""
 
+import hashlib
 import os
 from pathlib import Path
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
+from kcgs._atomic import atomic_path
 from kcgs._check import check_number
 from kcgs.errors import InvalidArgument
 from kcgs.segment.cleanup import Cleanup, Prediction
@@ -59,7 +62,6 @@ def find_object(
 
     Raises:
         ValueError: no such model, weights that cannot be had, or a file that is no such network.
-        ImportError: the package pooch is not installed.
 
     Example:
         ``segment(image, "object")``
@@ -92,12 +94,12 @@ def _find_weights(model: str | os.PathLike[str]) -> tuple[Path, _Weights]:
 def _download(url: str, path: Path, md5: str) -> None:
     """Fetch weights, whole or not at all, with a progress bar on a terminal."""
     try:
-        import pooch
-    except ImportError as error:
-        raise ImportError("the weights need the package pooch: pip install 'kcgs[object]'") from error
-    downloader = pooch.HTTPDownloader(progressbar=os.isatty(2), timeout=30)
-    try:
-        pooch.retrieve(url, f"md5:{md5}", path.name, path.parent, downloader=downloader)
-    except Exception as error:  # of requests, of the disk, or a wrong checksum
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(path) as temporary:
+            torch.hub.download_url_to_file(url, str(temporary), progress=os.isatty(2))
+            if hashlib.md5(temporary.read_bytes(), usedforsecurity=False).hexdigest() != md5:
+                raise OSError("the file has another checksum")
+    except OSError as error:  # of the network, too
+        reason = " ".join(str(error).split())
         hint = f"download {url} to {path}, or pass model=FILE.onnx"
-        raise ValueError(f"cannot load the weights of {path.stem}: {type(error).__name__}; {hint}") from error
+        raise ValueError(f"cannot load the weights of {path.stem}: {reason}; {hint}") from error
