@@ -41,12 +41,12 @@ def save_lines(path: Path, panels: Sequence[Panel], line: str, along: str, marke
 
     Rows with an interval, as `compare.differences` gives them, get error bars.
     """
-    height = (len(panels) + 1) // 2
+    width, height = min(2, len(panels)), (len(panels) + 1) // 2
     figure = Figure(figsize=(9.5, 0.6 + 3.3 * height), layout="constrained")
     handles: dict[object, Any] = {}
     names = list(dict.fromkeys(row[line] for panel in panels for row in panel.rows))
     with matplotlib.rc_context({"font.size": 9, "axes.grid": True, "grid.alpha": 0.3}):
-        all_axes = np.ravel(figure.subplots(height, 2, squeeze=False))
+        all_axes = np.ravel(figure.subplots(height, width, squeeze=False))
     for panel, axes in zip(panels, all_axes, strict=False):
         rows_with_values = [
             row for row in panel.rows if not (is_missing(row.get(panel.x)) or is_missing(row.get(panel.y)))

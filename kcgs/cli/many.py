@@ -19,8 +19,9 @@ from kcgs.errors import InvalidArgument
 from . import options
 from .commands import app
 from .common import INTERRUPTED, Json, Quiet, print_report
-from .many_batches import check_shards, complete_shards, count_done, make_batches, run_batch, takes_one_image
+from .many_batches import make_batches, run_batch, takes_one_image
 from .many_jobs import FitJob, Outcome
+from .many_shards import Shards
 
 
 def _check_batch(value: str) -> str:
@@ -111,7 +112,8 @@ def fit_many_command(
         workers = 2 * len(devices) if on_gpu else max(1, _count_cores() // threads)
     batches = make_batches(jobs, "1" if single else batch, shard, workers or 1, devices, output)
     workers = None if workers is None else min(workers, len(batches))
-    check_shards(batches)
+    shards = Shards([batch.work for batch in batches])
+    shards.check()
     outcomes = dict[int, Outcome]()
     try:
         with Progress("fit-many", visible=not quiet) as progress:
@@ -122,10 +124,10 @@ def fit_many_command(
                     for warning in outcome.warnings:
                         typer.echo(f"warning: {jobs[index].image.name}: {warning}", err=True)
                 progress.update(len(outcomes) / len(jobs), f"{len(outcomes)} of {len(jobs)}")
-                complete_shards(batches, number, outcomes)
+                shards.add(batches[number].work, results)
     except KeyboardInterrupt:
         # a worker may have written a file of which the main process did not hear
-        done = f"{count_done(batches)} of {len(jobs)} images are done"
+        done = f"{sum(batch.work.count_done() for batch in batches)} of {len(jobs)} images are done"
         typer.echo(f"kcgs: interrupted: {done}; the same command goes on where it stopped", err=True)
         raise typer.Exit(INTERRUPTED) from None
     finally:

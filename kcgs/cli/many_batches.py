@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from .many_jobs import FitJob, Outcome, fit_jobs, is_done
-from .many_shards import ShardPart, complete_shard, fingerprint_of, fit_part
+from .many_jobs import FileBatch, FitJob, Outcome
+from .many_shards import ShardPart, fingerprint_of
 from .options import FitRequest
 
 # pixels of a batch: on a core more leave its cache, and a GPU is busy from then on
@@ -22,20 +22,12 @@ class Batch(NamedTuple):
 
     indices: tuple[int, ...]
     """Of the images among all of the command."""
-    work: tuple[FitJob, ...] | ShardPart
+    work: FileBatch | ShardPart
 
 
 def run_batch(batch: Batch) -> list[Outcome]:
     """Fit the images of a batch; the outcomes are in their order."""
-    return fit_part(batch.work) if isinstance(batch.work, ShardPart) else fit_jobs(batch.work)
-
-
-def count_done(batches: Sequence[Batch]) -> int:
-    """Count the images whose scenes are on disk, from the same images and settings."""
-    files = (batch.work for batch in batches if not isinstance(batch.work, ShardPart))
-    parts = (batch.work for batch in batches if isinstance(batch.work, ShardPart))
-    num_in_shards = sum(len(part.images) for part in parts if part.is_done())
-    return num_in_shards + sum(is_done(job) for jobs in files for job in jobs)
+    return batch.work.run()
 
 
 def takes_one_image(request: FitRequest) -> str | None:
@@ -72,31 +64,12 @@ def make_batches(
             for number, part in enumerate(parts):
                 device = devices[len(batches) % len(devices)]
                 chosen = tuple(jobs[k]._replace(request=jobs[k].request._replace(device=device)) for k in part)
-                work: tuple[FitJob, ...] | ShardPart = chosen
+                work: FileBatch | ShardPart = FileBatch(chosen)
                 if shard is not None:
                     work = ShardPart(_shard_path(output, num_shards), number, chosen, size, fingerprint)
                 batches.append(Batch(tuple(part), work))
             num_shards += 1
     return batches
-
-
-def check_shards(batches: Sequence[Batch]) -> None:
-    """Refuse shards that are there from other images or with other settings, before any work."""
-    for batch in batches:
-        if isinstance(batch.work, ShardPart):
-            batch.work.check()
-
-
-def complete_shards(batches: Sequence[Batch], number: int, outcomes: Mapping[int, Outcome]) -> None:
-    """Write the shard of the batch that was done last, once all its parts are."""
-    work = batches[number].work
-    if not isinstance(work, ShardPart):
-        return
-    same = [(b.work, b.indices) for b in batches if isinstance(b.work, ShardPart) and b.work.shard == work.shard]
-    images = {index: job.image.name for part, indices in same for index, job in zip(indices, part.images, strict=True)}
-    if images.keys() <= outcomes.keys():
-        rows = {name: outcomes[index].row for index, name in images.items()}
-        complete_shard([part for part, _ in same], {name: row["error"] for name, row in rows.items() if "error" in row})
 
 
 def _by_size(jobs: Sequence[FitJob]) -> dict[Size | None, list[int]]:

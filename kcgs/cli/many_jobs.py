@@ -64,6 +64,20 @@ class BatchFit(NamedTuple):
     warnings: tuple[str, ...]
 
 
+class FileBatch(NamedTuple):
+    """Images that one job fits, with a file for each."""
+
+    images: tuple[FitJob, ...]
+
+    def run(self) -> list[Outcome]:
+        """Fit the images, unless their scenes are there."""
+        return fit_jobs(self.images)
+
+    def count_done(self) -> int:
+        """Count the images whose scenes are there, from the same image, mask and settings, with their rows."""
+        return sum(map(_is_done, self.images))
+
+
 def load_job(job: FitJob) -> Loaded:
     """Read the image of a job and its regions."""
     from kcgs.data import load_image
@@ -166,8 +180,7 @@ def _failure(error: Exception) -> Outcome:
     return Outcome({"error": describe_error(error)}, True)
 
 
-def is_done(job: FitJob) -> bool:
-    """Return whether the scene is there, from the same image, mask and settings, and its row."""
+def _is_done(job: FitJob) -> bool:
     try:
         return _read_kept(job, _fingerprint(job)) is not None
     except OSError:

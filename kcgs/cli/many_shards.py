@@ -5,12 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from .common import describe_error, replace_undefined
-from .many_jobs import FitJob, Loaded, Outcome, describe_settings, fit_batch, load_job
+from .many_jobs import FileBatch, FitJob, Loaded, Outcome, describe_settings, fit_batch, load_job
 
 
 class ShardPart(NamedTuple):
@@ -32,33 +33,66 @@ class ShardPart(NamedTuple):
 
         return shard_path(self.shard.with_suffix(".parts"), self.number)
 
-    def check(self) -> None:
-        """Refuse a shard that is there from other images or with other settings, unless it may be replaced."""
-        is_kept = self.shard.is_file() and not self.images[0].overwrite
-        if is_kept and _notes(self.shard).get("fingerprint") != self.fingerprint:
-            problem = "is damaged, or was made from other images or with other settings"
-            raise FileExistsError(f"{self.shard} {problem}; --overwrite replaces such shards")
+    @property
+    def own_fingerprint(self) -> str:
+        """That of the file of the part: another size of batches makes other parts of the same shard."""
+        return _hash((self.fingerprint, [job.image.name for job in self.images]))
 
-    def is_done(self) -> bool:
-        """Whether the scenes of the part are on disk."""
-        return any(_notes(path).get("fingerprint") == self.fingerprint for path in (self.shard, self.path))
+    def run(self) -> list[Outcome]:
+        """Fit the images, and write their scenes, unless they are in the shard or in the file of the part."""
+        kept = _read_kept(self, self.shard, self.fingerprint) or _read_kept(self, self.path, self.own_fingerprint)
+        return kept or _fit_part(self)
+
+    def count_done(self) -> int:
+        """Count the images whose scenes are on disk."""
+        files = {self.shard: self.fingerprint, self.path: self.own_fingerprint}
+        return len(self.images) * any(_fingerprint_in(path) == own for path, own in files.items())
+
+
+class Shards:
+    """The shards of a command, if it writes any: each is written once all its parts are fitted."""
+
+    def __init__(self, work: Sequence[FileBatch | ShardPart]) -> None:
+        self._parts: dict[Path, list[ShardPart]] = {}
+        for part in work:
+            if isinstance(part, ShardPart):
+                self._parts.setdefault(part.shard, []).append(part)
+        self._rows: dict[Path, dict[str, dict[str, Any]]] = {shard: {} for shard in self._parts}
+
+    def check(self) -> None:
+        """Refuse shards that are there from other images or with other settings, unless they may be replaced."""
+        for shard, (part, *_) in self._parts.items():
+            is_kept = shard.is_file() and not part.images[0].overwrite
+            if is_kept and _fingerprint_in(shard) != part.fingerprint:
+                problem = "is damaged, or was made from other images or with other settings"
+                raise FileExistsError(f"{shard} {problem}; --overwrite replaces such shards")
+
+    def add(self, part: FileBatch | ShardPart, outcomes: Sequence[Outcome]) -> None:
+        """Count a part as done, and write its shard if it was the last one."""
+        if not isinstance(part, ShardPart):
+            return
+        rows, parts = self._rows[part.shard], self._parts[part.shard]
+        rows |= {job.image.name: outcome.row for job, outcome in zip(part.images, outcomes, strict=True)}
+        if len(rows) == sum(len(each.images) for each in parts):
+            _complete(parts, {name: row["error"] for name, row in rows.items() if "error" in row})
 
 
 def fingerprint_of(jobs: Sequence[FitJob]) -> str:
     """Hash the settings, and the names and sizes of images and masks, but not their contents: there may be millions."""
     files = [(job.image.name, _bytes(job.image), _bytes(Path(job.regions)) or job.regions) for job in jobs]
-    return hashlib.sha256(repr((describe_settings(jobs[0]), files)).encode()).hexdigest()
+    return _hash((describe_settings(jobs[0]), files))
+
+
+def _hash(value: object) -> str:
+    return hashlib.sha256(repr(value).encode()).hexdigest()
 
 
 def _bytes(path: Path) -> int | None:
     return path.stat().st_size if path.is_file() else None
 
 
-def fit_part(part: ShardPart) -> list[Outcome]:
-    """Fit the images of a part, and write their scenes, unless the shard or the part is there."""
-    for path in (part.shard, part.path):
-        if (kept := _read_kept(part, path)) is not None:
-            return kept
+def _fit_part(part: ShardPart) -> list[Outcome]:
+    """Fit the images of a part, and write their scenes."""
     outcomes: dict[int, Outcome] = {}
     loaded: dict[int, Loaded] = {}
     for index, job in enumerate(part.images):
@@ -66,7 +100,7 @@ def fit_part(part: ShardPart) -> list[Outcome]:
             one = load_job(job)
             size = (one.image.shape[1], one.image.shape[2])
             if part.size not in (None, size):
-                raise ValueError(f"it has {size[1]} x {size[0]} pixels, its file says another size")
+                raise ValueError(f"it has {size[1]} x {size[0]} pixels, others of its shard have another size")
             loaded[index] = one
         except Exception as error:
             outcomes[index] = Outcome({"error": describe_error(error)}, True)
@@ -99,7 +133,7 @@ def _fit_and_save(part: ShardPart, loaded: dict[int, Loaded], errors: dict[int, 
     ]
     rows = [replace_undefined(row) for row in rows]
     failed = {part.images[index].image.name: error for index, error in errors.items()}
-    notes = {"fingerprint": part.fingerprint, "rows": json.dumps(rows), "errors": json.dumps(failed)}
+    notes = {"fingerprint": part.own_fingerprint, "rows": json.dumps(rows), "errors": json.dumps(failed)}
     part.path.parent.mkdir(exist_ok=True)
     save_shard(part.path, scenes, names, psnr, notes)
     return {
@@ -108,14 +142,18 @@ def _fit_and_save(part: ShardPart, loaded: dict[int, Loaded], errors: dict[int, 
     }
 
 
-def _read_kept(part: ShardPart, path: Path) -> list[Outcome] | None:
+def _read_kept(part: ShardPart, path: Path, fingerprint: str) -> list[Outcome] | None:
     """Return the rows of a part that are in a file of the same images and settings; None: it is not there."""
     notes = _notes(path)
-    if notes.get("fingerprint") != part.fingerprint:
+    if notes.get("fingerprint") != fingerprint:
         return None
     rows: dict[str, dict[str, Any]] = dict(zip(json.loads(notes["names"]), json.loads(notes["rows"]), strict=True))
     rows |= {name: {"error": error} for name, error in json.loads(notes["errors"]).items()}
     return [Outcome(rows[job.image.name], False) for job in part.images]
+
+
+def _fingerprint_in(path: Path) -> str | None:
+    return _notes(path).get("fingerprint")
 
 
 def _notes(path: Path) -> dict[str, str]:
@@ -128,8 +166,8 @@ def _notes(path: Path) -> dict[str, str]:
         return {}
 
 
-def complete_shard(parts: Sequence[ShardPart], errors: Mapping[str, str]) -> None:
-    """Write a shard from its parts, and remove these; nothing where the shard is there, or no image was fitted.
+def _complete(parts: Sequence[ShardPart], errors: Mapping[str, str]) -> None:
+    """Write a shard from its parts, unless it is there or no image was fitted, and remove the parts.
 
     Args:
         parts: all of the shard.
@@ -138,20 +176,19 @@ def complete_shard(parts: Sequence[ShardPart], errors: Mapping[str, str]) -> Non
     from kcgs.data import save_shard, stack_scenes
     from kcgs.files import load
 
-    scenes = [load(part.path) for part in parts if part.path.is_file()]
-    if not scenes:
-        return
-    names, psnr, rows = [], [], []
-    for scene in scenes:
-        notes = scene.metadata
-        names += json.loads(notes["names"])
-        psnr += [math.inf if number is None else number for number in json.loads(notes["psnr"])]
-        rows += json.loads(notes["rows"])
-    notes = {"fingerprint": parts[0].fingerprint, "rows": json.dumps(rows), "errors": json.dumps(errors)}
-    singles = [one for scene in scenes for one in scene]
-    with_maps = scenes[0].regions is not None
-    joined = stack_scenes(singles, scenes[0].num_gaussians, with_maps=with_maps)
-    save_shard(parts[0].shard, joined, names, psnr, notes)
-    for part in parts:
-        part.path.unlink(missing_ok=True)
-    parts[0].path.parent.rmdir()
+    shard, fingerprint = parts[0].shard, parts[0].fingerprint
+    # a command that was killed while it removed parts left some of them
+    is_there = _fingerprint_in(shard) == fingerprint
+    scenes = [] if is_there else [load(part.path) for part in parts if part.path.is_file()]
+    if scenes:
+        names, psnr, rows = [], [], []
+        for scene in scenes:
+            notes = scene.metadata
+            names += json.loads(notes["names"])
+            psnr += [math.inf if number is None else number for number in json.loads(notes["psnr"])]
+            rows += json.loads(notes["rows"])
+        notes = {"fingerprint": fingerprint, "rows": json.dumps(rows), "errors": json.dumps(errors)}
+        singles = [one for scene in scenes for one in scene]
+        joined = stack_scenes(singles, scenes[0].num_gaussians, with_maps=scenes[0].regions is not None)
+        save_shard(shard, joined, names, psnr, notes)
+    shutil.rmtree(parts[0].path.parent, ignore_errors=True)

@@ -345,6 +345,38 @@ class TestShards:
         assert rows() == before[1]
         assert json.loads(fit_many(*arguments, "--seed", "1", "--overwrite").out)["fitted"] == 3
 
+    def test_goes_on_with_other_batches(self, fit_many: Kcgs, monkeypatch: pytest.MonkeyPatch) -> None:
+        """What is left of the parts of an interrupted command is no part of the shard."""
+        arguments = ("photos", *SETTINGS, "--shard", "4", "--json", "--batch")
+        fit_batch = many_shards.fit_batch
+        for size in (1, 2):
+            count = 0
+
+            def interrupt(*values: Any) -> Any:
+                nonlocal count
+                count += 1
+                return signal.raise_signal(signal.SIGINT) if count == 2 else fit_batch(*values)
+
+            monkeypatch.setattr(many_shards, "fit_batch", interrupt)
+            assert fit_many(*arguments, str(size)).code == 130
+        code, out, err = fit_many(*arguments, "3")
+        assert code == 0 and json.loads(out)["fitted"] == 3, err
+        assert SceneDataset("out").names == ["a.png", "b.png", "c.png"]
+        assert {path.name for path in Path("out").iterdir()} == {"00000.safetensors", "results.csv"}
+
+    def test_parts_beside_a_complete_shard_are_removed(self, fit_many: Kcgs) -> None:
+        """A command may be killed while it removes them."""
+        arguments = ("photos", *SETTINGS, "--shard", "4", "--batch", "1", "--json")
+        assert fit_many("photos/a.png", *SETTINGS, "-o", "other", "--shard", "4").code == 0
+        assert fit_many(*arguments).code == 0
+        shard = Path("out/00000.safetensors")
+        before = shard.read_bytes()
+        Path("out/00000.parts").mkdir()
+        Path("out/00000.parts/00001.safetensors").write_bytes(Path("other/00000.safetensors").read_bytes())
+        code, out, err = fit_many(*arguments)
+        assert code == 0 and json.loads(out)["kept"] == 3, err
+        assert shard.read_bytes() == before and not Path("out/00000.parts").exists()
+
     def test_maps_and_sizes(self, fit_many: Kcgs) -> None:
         """A shard has images of one size, each with its map."""
         Image.new("RGB", (20, 30), "red").save("photos/tall.png")
