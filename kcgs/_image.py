@@ -57,10 +57,10 @@ def as_image(
     if not (math.isfinite(low) and math.isfinite(high)):
         check_image(name, image.detach().cpu())  # raises: not finite, or empty
     if image.shape[-1] in (1, 3, 4) and min(image.shape[-3:-1]) > 4:
-        advice = f"pass {name}.permute(2, 0, 1), or a numpy array (H, W, C)"
+        layouts, advice = ("(C, H, W)", "(H, W, C)"), f"pass {name}.permute(2, 0, 1), or a numpy array (H, W, C)"
         if image.ndim == 4:
-            advice = f"pass {name}.permute(0, 3, 1, 2)"
-        raise InvalidArgument(name, "(C, H, W)", f"{tuple(image.shape)}, which looks like (H, W, C): {advice}")
+            layouts, advice = ("(B, C, H, W)", "(B, H, W, C)"), f"pass {name}.permute(0, 3, 1, 2)"
+        raise InvalidArgument(name, layouts[0], f"{tuple(image.shape)}, which looks like {layouts[1]}: {advice}")
     if low < -tolerance or high > 1 + tolerance:
         raise InvalidArgument(name, "in [0, 1]", f"[{low:g}, {high:g}]{_scale_hint(image)}")
     if not has_alpha or keep_alpha:

@@ -19,7 +19,7 @@ def map_of(regions: RegionMap, image: int) -> RegionMap:
 
 def regions_per_map(regions: RegionMap) -> list[int]:
     """Return the number of regions of each map."""
-    return [len(index.unique()) for index in regions.index]
+    return [regions.num_regions] if regions.num_maps is None else [len(index.unique()) for index in regions.index]
 
 
 def join_maps(maps: Sequence[RegionMap | None]) -> RegionMap | None:

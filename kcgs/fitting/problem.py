@@ -171,13 +171,12 @@ def make_problem(
 
 def _check_batch(problem: Problem) -> None:
     """Refuse what takes one image at a time, and more images than there is memory for."""
-    takes_one = {"target_psnr": problem.config.target_psnr, "objective": problem.objects.objective}
-    for name, value in takes_one.items():
+    count, channels, height, width = problem.canvas.shape
+    for name, expected, value in (
+        ("target_psnr", "None", problem.config.target_psnr),
+        ("objective", "a name", problem.objects.objective),
+    ):
         if value is not None:
-            expected = "a name" if name == "objective" else "None"
-            raise InvalidArgument(
-                name, f"{expected} with {problem.num_images} images: fit them one by one", repr(value)
-            )
-    _, channels, height, width = problem.canvas.shape
-    per_pixel, per_gaussian = _PIXEL_BYTES + channels * _CHANNEL_BYTES, _GAUSSIAN_BYTES
-    check_batch_memory("image", problem.canvas, height * width * per_pixel + problem.num_gaussians * per_gaussian)
+            raise InvalidArgument(name, f"{expected} with {count} images: fit them one by one", repr(value))
+    pixels = height * width * (_PIXEL_BYTES + channels * _CHANNEL_BYTES)
+    check_batch_memory("image", problem.canvas, pixels + problem.num_gaussians * _GAUSSIAN_BYTES)

@@ -33,7 +33,7 @@ class FitState(FieldState):
     num_initial: int
     """Rows at the start."""
     initial_counts: list[int] = field(default_factory=list)
-    """Gaussians of each image at the start, where they differ from it."""
+    """Gaussians of each image at the start, where some have fewer than `num_initial`; else empty."""
     num_requested: int
     """Gaussians of each image that the schedule last asked for; fewer exist where fewer were of use."""
     num_additions: int = 0

@@ -301,7 +301,7 @@ class TestErrors:
         [
             ({"image": None}, TypeError, "image must be a Tensor"),
             ({"image": torch.zeros(4, 4)}, ValueError, "image must have 3 or 4 dimensions"),
-            ({"image": torch.zeros(2, 5, 5, 3)}, ValueError, r"image must be \(C, H, W\)"),
+            ({"image": torch.zeros(2, 5, 5, 3)}, ValueError, r"image must be \(B, C, H, W\); .*\(B, H, W, C\)"),
             ({"image": torch.zeros(0, 3, 4, 4)}, ValueError, "image must not be empty"),
             (
                 {"image": torch.full((3, 4, 4), 2.0)},
