@@ -40,13 +40,14 @@ def segment(
         typer.Option(metavar="KEY=VALUE", help="Option of the method, as often as needed; the value is JSON or text."),
     ] = None,
     box: Annotated[
-        str | None, typer.Option(metavar="X0,Y0,X1,Y1", help="Of grabcut and sam: a box around the object.")
+        str | None, typer.Option(metavar="X0,Y0,X1,Y1", help="Of grabcut, object and sam: a box around the object.")
     ] = None,
     foreground: Annotated[
-        list[str] | None, typer.Option(metavar="X,Y", help="Of grabcut and sam: a point of the object.")
+        list[str] | None, typer.Option(metavar="X,Y", help="Of grabcut, object and sam: a point of the object.")
     ] = None,
     background: Annotated[
-        list[str] | None, typer.Option(metavar="X,Y", help="Of grabcut and sam: a point that is not of the object.")
+        list[str] | None,
+        typer.Option(metavar="X,Y", help="Of grabcut, object and sam: a point beside the object."),
     ] = None,
     overlay: Annotated[
         Path | None, typer.Option(help="Write the image with the regions and their ids over it into this file.")

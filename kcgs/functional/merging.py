@@ -17,7 +17,9 @@ _BAND = 12.0  # pixels across a contour over which its error counts: windows rea
 _ROUNDS = 8  # of merging and judging again, at most
 
 
-def merge_regions(image: Tensor, labels: Tensor, merge_cost: float = MERGE_COST) -> Tensor:
+def merge_regions(
+    image: Tensor, labels: Tensor, merge_cost: float = MERGE_COST, objects: Tensor | None = None
+) -> Tensor:
     """Merge regions whose contour saves less error than Gaussians would save with its bits.
 
     Convention: what a contour saves is predicted from the pixels near it: how much better two linear colours, mixed
@@ -30,6 +32,7 @@ def merge_regions(image: Tensor, labels: Tensor, merge_cost: float = MERGE_COST)
         image: :math:`(C, H, W)` floating in [0, 1].
         labels: :math:`(H, W)` integer, non-negative.
         merge_cost: squared error that a pixel of contour must save, at least 0.
+        objects: :math:`(H, W)` integer, a coarser map: regions of two objects do not merge; None: all may.
 
     Returns:
         :math:`(H, W)` int64; merged regions have the id of one of them; one region where no contour saves its cost.
@@ -48,13 +51,18 @@ def merge_regions(image: Tensor, labels: Tensor, merge_cost: float = MERGE_COST)
     labels = check_labels("labels", labels)
     check_problem(image, labels)
     ids, labels = torch.unique(labels, return_inverse=True)
+    owners = torch.zeros_like(ids)
+    if objects is not None:
+        owners[labels] = check_labels("objects", objects).to(ids)
     for _ in range(_ROUNDS):
         gains = contour_gain(image, labels)
         saved = {
             pair: _BAND * (gain.smooth_error - gain.contour_error) * (gain.share >= _MIN_SHARE)
             for pair, gain in gains.items()
         }
-        costly = sorted((value, pair) for pair, value in saved.items() if value < merge_cost)
+        costly = sorted(
+            (value, (a, b)) for (a, b), value in saved.items() if value < merge_cost and owners[a] == owners[b]
+        )
         if not costly:
             break
         # a region merges once per round, so that the larger region is judged before it merges again

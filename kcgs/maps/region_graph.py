@@ -34,16 +34,23 @@ def pairs_to_merge(image: Tensor, labels: Tensor, max_regions: int) -> list[tupl
 
 
 class RegionGraph:
-    """The regions 0 to R - 1: their areas, and along how many pixel sides they touch; regions merge in place."""
+    """The regions 0 to R - 1: their areas, and along how many pixel sides they touch; regions merge in place.
 
-    def __init__(self, labels: Labels) -> None:
+    With objects, a second map of which no region crosses a contour, regions of different objects are no neighbours.
+    """
+
+    def __init__(self, labels: Labels, objects: Labels | None = None) -> None:
         """Count areas and shared sides."""
         self.areas: Labels = np.bincount(labels.ravel())
         self.borders: list[dict[int, int]] = [{} for _ in self.areas]
         self._parents = np.arange(len(self.areas))
         pairs, _, lengths = unique_pairs(contour_edges(torch.from_numpy(labels))[0])
+        owners = np.zeros(len(self.areas), np.int64)
+        if objects is not None:
+            owners[labels] = objects
         for (a, b), length in zip(pairs.tolist(), lengths.tolist(), strict=True):
-            self.borders[a][b] = self.borders[b][a] = length
+            if owners[a] == owners[b]:
+                self.borders[a][b] = self.borders[b][a] = length
 
     def merge(self, source: int, target: int) -> None:
         """Add ``source`` to its neighbour ``target``."""
@@ -84,7 +91,7 @@ def merge_nearest(graph: RegionGraph, sums: NDArray[np.float64], max_regions: in
     ]
     heapq.heapify(queue)
     count = len(graph.areas)
-    while count > max_regions:
+    while count > max_regions and queue:
         _, a, b, area_a, area_b = heapq.heappop(queue)
         if b not in graph.borders[a] or (area_a, area_b) != (graph.areas[a], graph.areas[b]):
             continue

@@ -147,14 +147,15 @@ def order_by_area(labels: Labels) -> Labels:
     return rank[regions]
 
 
-def merge_small(labels: Labels, min_size: int) -> Labels:
+def merge_small(labels: Labels, min_size: int, objects: Labels | None = None) -> Labels:
     """Merge every 4-connected piece under ``min_size`` pixels into the neighbour with the longest common border.
 
     The smallest piece is merged first, and a piece that reaches ``min_size`` by merging stays. Of neighbours with equal
-    borders the larger takes it, then the one whose first pixel comes earlier. Pieces that stay keep their label.
+    borders the larger takes it, then the one whose first pixel comes earlier. Pieces that stay keep their label. Pieces
+    of different objects, of which no label crosses a contour, do not merge.
     """
     pieces = connect(labels)
-    graph = RegionGraph(pieces)
+    graph = RegionGraph(pieces, objects)
     queue = [(int(area), piece) for piece, area in enumerate(graph.areas) if area < min_size]
     heapq.heapify(queue)
     while queue:
@@ -171,19 +172,25 @@ def merge_small(labels: Labels, min_size: int) -> Labels:
     return label_of_piece[graph.roots()][pieces]
 
 
-def merge_similar(lab: NDArray[np.float32], regions: Labels, max_regions: int) -> Labels:
+def merge_similar(lab: NDArray[np.float32], regions: Labels, max_regions: int, objects: Labels | None = None) -> Labels:
     """Merge the two neighbours nearest in mean colour until at most ``max_regions`` of the regions 0 to R - 1 are left.
 
-    A merged region has the mean of all its pixels and the id of its largest part.
+    A merged region has the mean of all its pixels and the id of its largest part. Regions of different objects do not
+    merge.
     """
-    graph = RegionGraph(regions)
+    graph = RegionGraph(regions, objects)
     merge_nearest(graph, lab_sums(lab, regions), max_regions)
     return graph.roots()[regions]
 
 
-def clean(labels: Labels, min_size: int) -> Labels:
-    """Return 4-connected regions of at least ``min_size`` pixels, by decreasing area."""
-    return order_by_area(connect(merge_small(labels, min_size)))
+def clean(labels: Labels, min_size: int, objects: Labels | None = None) -> Labels:
+    """Return 4-connected regions of at least ``min_size`` pixels, by decreasing area.
+
+    With objects, regions are divided by their contours first.
+    """
+    if objects is not None:
+        labels = labels * (int(objects.max()) + 1) + objects
+    return order_by_area(connect(merge_small(labels, min_size, objects)))
 
 
 def _region_means(regions: Labels, scores: NDArray[np.float64]) -> Tensor:

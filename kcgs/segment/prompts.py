@@ -10,21 +10,31 @@ from kcgs._check import check_number, check_numbers
 from kcgs.errors import InvalidArgument, InvalidArgumentType
 
 Points = Tensor | Sequence[Any]
+Point = tuple[float, float]
+Box = tuple[float, float, float, float]
 
 
 class Prompt(NamedTuple):
     """What says where an object is, in pixels."""
 
-    box: tuple[float, float, float, float] | None
+    box: Box | None
     """Left, top, right, bottom, within the image."""
-    foreground: list[tuple[float, float]]
+    foreground: list[Point]
     """Points (x, y) of the object."""
-    background: list[tuple[float, float]]
+    background: list[Point]
     """Points (x, y) that are not of the object."""
+
+    @property
+    def clicks(self) -> list[tuple[Point, int]]:
+        """All points, with label 1 for the object and 0 for the background."""
+        return [(point, 1) for point in self.foreground] + [(point, 0) for point in self.background]
 
 
 def check_prompt(image: Tensor, box: Points | None, foreground: Points | None, background: Points | None) -> Prompt:
-    """Return the prompt if its points lie in the image, (3, H, W), and its box has pixels of it."""
+    """Return the prompt of an image (3, H, W): its box has pixels of the image, its points lie in the image.
+
+    Points of the object lie in the box.
+    """
     height, width = image.shape[1:]
     corners = None
     if box is not None:
@@ -33,13 +43,20 @@ def check_prompt(image: Tensor, box: Points | None, foreground: Points | None, b
         if not (corners[0] < corners[2] and corners[1] < corners[3]):
             expected = f"left, top, right, bottom with pixels of the {width} x {height} image"
             raise InvalidArgument("box", expected, (left, top, right, bottom), verb="hold")
-    points = (_check_points(name, values, width, height) for name, values in (
-        ("foreground", foreground), ("background", background),
-    ))  # fmt: skip
-    return Prompt(corners, *points)
+    prompt = Prompt(
+        corners,
+        _check_points("foreground", foreground, width, height),
+        _check_points("background", background, width, height),
+    )
+    if corners is not None:
+        left, top, right, bottom = corners
+        for x, y in prompt.foreground:
+            if not (left <= x <= right and top <= y <= bottom):
+                raise InvalidArgument("foreground", "in the box", (x, y))
+    return prompt
 
 
-def _check_points(name: str, values: Points | None, width: int, height: int) -> list[tuple[float, float]]:
+def _check_points(name: str, values: Points | None, width: int, height: int) -> list[Point]:
     points = [] if values is None else _to_list(values)
     if isinstance(points, str) or not all(isinstance(point, Sequence) and len(point) == 2 for point in points):
         raise InvalidArgumentType(name, "a list of points (x, y)", repr(points))

@@ -23,6 +23,11 @@ class TestMergeRegions:
         assert merged.unique().tolist() == [0, 2]
         assert (merged[:, :60] == 0).all() and (merged[:, 60:] == 2).all()
 
+    def test_objects_stay_apart(self) -> None:
+        labels = (torch.arange(96) // 24).expand(64, 96)
+        merged = merge_regions(0.3 + 0.02 * noise(64, 96), labels, objects=labels // 2 + 5)
+        assert torch.equal(merged, labels // 2 * 2)
+
     @pytest.mark.parametrize(("rows", "count"), [(64, 2), (40, 1)])
     def test_colors_must_differ_along_most_of_a_contour(self, rows: int, count: int) -> None:
         image = 0.3 + 0.02 * noise(64, 96)

@@ -84,6 +84,11 @@ def test_bad_options(options: dict[str, Any], message: str) -> None:
         segment(scene()[0], "grabcut", **options)
 
 
+def test_no_object_is_found() -> None:
+    with pytest.raises(ValueError, match="no object is found: give another box, or a point of the object"):
+        segment(torch.full((3, 64, 96), 0.5), "grabcut", box=BOX, background=[(30, 30), (50, 20), (40, 40), (65, 30)])
+
+
 def test_without_opencv(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(ImportError, match=r"pip install 'kcgs\[grabcut\]'"):

@@ -13,8 +13,10 @@ from kcgs.data import chart_2x3, load_image, load_labels, save_labels
 from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.segment import Prediction, available_methods, method_options, register, segment, segment_with_scores
 from kcgs.segment.methods import auto
+from kcgs.segment.methods import objects as networks
 from kcgs.segment.registry import _methods
-from tests.segment.checks import assert_segmentation
+from tests.segment.checks import assert_segmentation, split_image
+from tests.segment.test_onnx import write_mixer
 
 METHODS = ["auto", "chan_vese", "felzenszwalb", "kmeans", "quickshift", "slic", "watershed"]
 
@@ -151,6 +153,42 @@ class TestAuto:
         for max_regions in (30, None):
             result = segment_with_scores(photo("coffee", 2), max_regions=max_regions)
             assert_segmentation(result, (200, 300))
+
+    @pytest.mark.parametrize("large", [1000, 10**9])
+    def test_regions_never_cross_the_contours_of_objects(self, monkeypatch: pytest.MonkeyPatch, large: int) -> None:
+        monkeypatch.setattr(auto, "_LARGE", large)
+        monkeypatch.setattr(auto, "_MAX_PIXELS", 20_000)
+        image, y, x = photo("coffee", 2), torch.arange(200)[:, None], torch.arange(300)
+        objects = 7 * ((y - 100) ** 2 + (x - 150) ** 2 < 60**2).long()  # a disc across cup, saucer and table
+        objects[:3, :3] = 9  # too small
+        result = segment_with_scores(image, objects=objects)
+        assert_segmentation(result, (200, 300))
+        assert result.names is not None and set(result.names.values()) == {"0", "7"}
+        inside = torch.tensor([region for region, name in result.names.items() if name == "7"])
+        assert len(inside) > 1 and torch.equal(torch.isin(result.labels, inside), objects == 7)
+        few = segment_with_scores(image, objects=objects, max_regions=2)
+        assert torch.equal(few.labels == 1, objects == 7) and few.names == {0: "0", 1: "7"}
+
+    def test_objects_of_a_flat_image(self) -> None:
+        objects = torch.zeros(60, 80, dtype=torch.bool)
+        objects[10:40, 20:50] = True
+        assert torch.equal(segment(torch.full((3, 60, 80), 0.4), objects=objects) == 1, objects)
+
+    def test_the_main_object(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        image = split_image(40, 60, 25)
+        image[:, 20:, 40:] = 1.0  # not blue, so not the object's
+        network = write_mixer(tmp_path / "net.onnx", [[-4.0, -4.0, 8.0]])
+        weights = networks._WEIGHTS["isnet-general-use"]
+        monkeypatch.setattr(networks, "_find_weights", lambda model: (network, weights))
+        labels, _, names = segment_with_scores(image, objects="object")
+        assert names == {0: "background", 1: "object", 2: "background"}
+        assert torch.equal(labels == 1, (image[2] > 0) & (image[0] == 0))
+
+    def test_bad_objects(self) -> None:
+        with pytest.raises(ValueError, match=r"objects must be of the image's size \(60, 80\); got \(6, 8\)"):
+            segment(torch.rand(3, 60, 80), objects=torch.zeros(6, 8, dtype=torch.int64))
+        with pytest.raises(TypeError, match="objects must be"):
+            segment(torch.rand(3, 60, 80), objects=3.0)
 
     def test_human_regions_are_covered(self, data_root: Path) -> None:
         folder = data_root / "bsds" / "42049"

@@ -13,8 +13,9 @@ from typing import Any
 import pytest
 import skimage.data
 import torch
+from torch import Tensor
 
-from kcgs.segment import segment, segment_with_scores
+from kcgs.segment import Prediction, segment, segment_with_scores
 from kcgs.segment.methods import objects
 from tests.segment.checks import split_image
 from tests.segment.test_onnx import write_mixer
@@ -54,6 +55,47 @@ class TestObject:
         image[2] = torch.linspace(0, 1, 40)
         areas = [int((segment(image, "object", model=network, threshold=t) == 1).sum()) for t in (0.5, 0.99)]
         assert areas[0] != areas[1]
+
+    def test_a_box_asks_for_what_is_in_it(self, network: Path) -> None:
+        image = torch.zeros(3, 60, 80)
+        image[2, 10:20, 5:20] = image[2, 30:50, 40:70] = 1.0
+        labels, scores, names = segment_with_scores(image, "object", model=network, box=(2, 6, 24, 25))
+        assert names == {0: "background", 1: "object"} and scores is not None and scores.isfinite().all()
+        expected = torch.zeros(60, 80, dtype=torch.int64)
+        expected[10:20, 5:20] = 1
+        assert torch.equal(labels, expected)
+
+    def test_the_network_sees_what_is_around_the_box(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        seen: list[tuple[int, ...]] = []
+
+        def predict(image: Tensor, *_: object) -> Prediction:
+            seen.append(tuple(image.shape))
+            return Prediction(torch.ones(image.shape[1:], dtype=torch.int64), torch.ones(image.shape[1:]))
+
+        monkeypatch.setattr(objects, "saliency", predict)
+        mask = segment(torch.rand(3, 60, 80), "object", model="net.onnx", box=(40, 20, 50, 30), min_size=1) == 1
+        assert seen == [(3, 26, 26)] and mask.sum() == 100 and mask[20:30, 40:50].all()
+
+    def test_clicks_correct_the_network(self, network: Path) -> None:
+        pytest.importorskip("cv2", reason="needs the extra: pip install 'kcgs[grabcut]'")
+        image = torch.rand(3, 90, 120, generator=torch.Generator().manual_seed(0)) * 0.1
+        image[2] = 0.0
+        image[2, 20:50, 20:50] = 0.9  # of the object, as the network says
+        image[0, 20:50, 50:80] = 0.9  # of the object, as the network does not say
+        image[2, 60:80, 90:110] = 0.9  # not of the object
+        truth = torch.zeros(90, 120, dtype=torch.bool)
+        truth[20:50, 20:80] = True
+        clicks = {"foreground": [(65, 35)], "background": [(100, 70)]}
+        labels, scores, names = segment_with_scores(image, "object", model=network, min_size=1, **clicks)
+        region = next(region for region, name in names.items() if name == "object")
+        assert ((labels == region) != truth).float().mean() < 0.005
+        assert scores is not None and scores.isfinite().all()
+
+    def test_nothing_in_the_box(self, network: Path) -> None:
+        image = torch.zeros(3, 40, 60)
+        image[2, 4:20, 5:20] = 1.0
+        with pytest.raises(ValueError, match="no object is found: give another box, or a point of the object"):
+            segment(image, "object", model=network, box=(30, 22, 40, 30))
 
     @pytest.mark.parametrize(
         ("options", "words"),

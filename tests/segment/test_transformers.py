@@ -122,7 +122,7 @@ def stable_masks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("kcgs.segment.methods.sam._MIN_STABILITY", 0.0)
 
 
-BOXES = [[10, 10, 40, 30], [30, 5, 55, 38]]
+BOX = [10, 10, 40, 30]
 PROMPTS = ["a dog", "the grass", "god"]
 SMALL_DINO = {"longer_side": 112, "num_clusters": 3}
 CASES = [
@@ -133,11 +133,10 @@ CASES = [
         ("sam", model, options, count)
         for model in SAMS
         for options, count in (
-            ({"boxes": BOXES}, None),
-            ({"boxes": torch.tensor(BOXES)}, None),
-            ({"points": [[[20, 20], [50, 38]]]}, None),
+            ({"box": BOX}, None),
+            ({"foreground": [[20, 20], [50, 38]]}, None),
             ({"foreground": [[20, 20]], "background": [[50, 38]]}, None),
-            ({"box": BOXES[0], "foreground": torch.tensor([[20, 20]])}, None),
+            ({"box": torch.tensor(BOX), "foreground": torch.tensor([[20, 20]])}, None),
             ({"grid": 2, "min_score": 0.0, "max_regions": 5, "min_size": 4}, None),
             ({"grid": 1, "min_score": 1.0}, 1),
         )
@@ -173,9 +172,10 @@ class TestSegment:
         assert labels.shape == size
 
     @pytest.mark.parametrize("model", SAMS)
-    def test_a_box_is_one_of_boxes(self, folder: Folder, model: str) -> None:
-        first = segment(IMAGE, "sam", model=folder(model), box=BOXES[0])
-        assert torch.equal(first, segment(IMAGE, "sam", model=folder(model), boxes=BOXES[:1]))
+    def test_a_prompt_asks_for_an_object(self, folder: Folder, model: str) -> None:
+        names = segment_with_scores(IMAGE, "sam", model=folder(model), box=BOX, min_size=1).names
+        assert names is not None and set(names.values()) == {"object", "background"}
+        assert segment_with_scores(IMAGE, "sam", model=folder(model), grid=1).names is None
 
     def test_masks_that_no_mask_covers_have_no_score(self, folder: Folder) -> None:
         scores = segment_with_scores(IMAGE, "sam", model=folder("sam"), grid=1, min_score=1.0).scores
@@ -196,11 +196,8 @@ class TestSegment:
                 ("dino", {option: 0}, f"{option} must be at least 1; got 0")
                 for option in ("num_clusters", "longer_side")
             ),
-            ("sam", {"boxes": torch.zeros(4)}, r"boxes must be numbers of shape \(any, 4\); got \(4,\)"),
-            ("sam", {"boxes": [[1, 2], [3]]}, "boxes must be numbers"),
-            ("sam", {"points": torch.zeros(0, 1, 2)}, "points must be numbers"),
-            ("sam", {"points": [[[1, 2]]], "boxes": torch.ones(1, 4)}, "boxes must be None"),
-            ("sam", {"boxes": BOXES, "box": BOXES[0]}, "boxes must be None with box"),
+            ("sam", {"box": [1, 2, 3]}, "box must be 4 numbers"),
+            ("sam", {"box": BOX, "foreground": [[50, 38]]}, r"foreground must be in the box; got \(50"),
             ("sam", {"background": [[1, 2]]}, "foreground must be given where there is no box"),
             ("sam", {"grid": 0}, "grid must be"),
             ("sam", {"min_score": 1.5}, "min_score must be"),

@@ -1,18 +1,21 @@
 """The default segmenter: clean regions of photos, without learned weights."""
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from kcgs._labels import check_labels
 from kcgs.compiled import image_threads_for_kernels
+from kcgs.errors import InvalidArgument
 from kcgs.functional import merge_regions
-from kcgs.maps import Labels
-from kcgs.segment.cleanup import Cleanup, clean, merge_similar, to_regions
+from kcgs.maps import Labels, compact
+from kcgs.segment.cleanup import Cleanup, Prediction, clean, merge_similar, merge_small, to_regions
 from kcgs.segment.images import lab_sums, reduce_image, rgb_to_lab
-from kcgs.segment.registry import register
+from kcgs.segment.registry import register, segment_with_scores
 from kcgs.segment.snapping import snap_contours
 
 # Tuned by how contours agree with those of people on photos of BSDS500, and what a fit gains: see `auto`.
@@ -34,7 +37,7 @@ _LARGE = 2 * 1920 * 1080
 
 @register("auto", Cleanup(max_regions=30))
 @image_threads_for_kernels
-def auto(image: Tensor, *, min_size: int, max_regions: int | None) -> Tensor:
+def auto(image: Tensor, *, objects: Any = None, min_size: int, max_regions: int | None) -> Prediction:
     """Segment a photo into up to 30 clean connected regions, fewer where contours would save too little.
 
     The method of Felzenszwalb and Huttenlocher, with its scale halved up to twice while fewer than 4 regions result
@@ -47,6 +50,20 @@ def auto(image: Tensor, *, min_size: int, max_regions: int | None) -> Tensor:
     transitions and foliage, there is none. With 400 Gaussians a fit gains 0.53 dB by these maps
     (`python -m benchmarks maps`).
 
+    With objects no region crosses their contours, so that an edit has all of an object in regions of its own. Their
+    names are those of the objects.
+
+    Args:
+        image: as `segment` takes it, any size.
+        objects: a label map of the image's size, as :func:`kcgs.fit` takes it, whose ids are the names; or "object":
+            the main object, which the method of this name finds; None: areas of similar colour only. Pieces under
+            ``min_size`` are part of what is around them.
+        min_size: of the clean-up, in pixels.
+        max_regions: of the clean-up.
+
+    Raises:
+        TypeError, ValueError: ``objects`` is no label map of the image's size; errors of the method "object".
+
     Example:
         >>> from kcgs.segment import segment
         >>> image = torch.zeros(3, 40, 60)
@@ -56,27 +73,63 @@ def auto(image: Tensor, *, min_size: int, max_regions: int | None) -> Tensor:
         ([0, 1], 1)
     """
     image = image.cpu()
+    if objects is None:
+        return Prediction(_divide(image, None, min_size, max_regions))
+    owners, names = _find_objects(image, objects, min_size)
+    regions = _divide(image, owners, min_size, max_regions)
+    owner_of_region = np.zeros(int(regions.max()) + 1, np.int64)
+    owner_of_region[regions] = owners
+    return Prediction(regions, names=[names[owner] for owner in owner_of_region])
+
+
+def _find_objects(image: Tensor, objects: Any, min_size: int) -> tuple[Labels, list[str]]:
+    """Return a map of objects without small pieces, from 0 on, and the name of each."""
+    if isinstance(objects, str) and objects == "object":
+        labels, _, names = segment_with_scores(image, "object", min_size=min_size)
+        assert names is not None
+        return labels.numpy(), [names[label] for label in range(len(names))]
+    labels = check_labels("objects", objects, dims=(2,)).cpu()
+    if labels.shape != image.shape[1:]:
+        raise InvalidArgument("objects", f"of the image's size {tuple(image.shape[1:])}", tuple(labels.shape))
+    ids, index = compact(labels)
+    return merge_small(index.numpy().astype(np.int64), min_size), [str(label) for label in ids.tolist()]
+
+
+def _divide(image: Tensor, objects: Labels | None, min_size: int, max_regions: int | None) -> Labels:
+    """Return the regions of an image, of which none crosses the contour of an object."""
     if image[0].numel() <= _LARGE:
-        return torch.from_numpy(_regions(image, min_size))
-    small = reduce_image(image, _MAX_PIXELS)
-    smallest = max(1, round(min_size * small[0].numel() / image[0].numel()))
-    regions = _regions(small, smallest)
-    if max_regions is not None:
-        regions = merge_similar(rgb_to_lab(small), regions, max_regions)
-    return torch.from_numpy(_enlarge(image, regions))
+        regions = _regions(image, objects, min_size)
+    else:
+        small = reduce_image(image, _MAX_PIXELS)
+        smallest = max(1, round(min_size * small[0].numel() / image[0].numel()))
+        parts = None if objects is None else _resize(objects, small.shape[1:])
+        regions = _merge_similar(small, _regions(small, parts, smallest), max_regions, parts)
+        regions = _enlarge(image, regions)
+    if objects is None:
+        return regions
+    return _merge_similar(image, clean(regions, min_size, objects), max_regions, objects)
 
 
-def _regions(image: Tensor, min_size: int) -> Labels:
-    best = np.zeros(image.shape[1:], dtype=np.int64)
+def _merge_similar(image: Tensor, regions: Labels, max_regions: int | None, objects: Labels | None) -> Labels:
+    if max_regions is None or regions.max() < max_regions:
+        return regions
+    return merge_similar(rgb_to_lab(image), regions, max_regions, objects)
+
+
+def _regions(image: Tensor, objects: Labels | None, min_size: int) -> Labels:
+    best = np.zeros(image.shape[1:], dtype=np.int64) if objects is None else clean(objects, 1)
     if (image != image[:, :1, :1]).any():
         for scale in _SCALES:
-            best = _refine(best, _felzenszwalb_regions(image, scale, min_size), min_size)
+            best = _refine(best, _felzenszwalb_regions(image, scale, min_size, objects), min_size, objects)
             if best.max() + 1 >= _MIN_REGIONS or _spread(image, best) < _FLAT:
                 break
-    return merge_regions(image, torch.from_numpy(best)).numpy() if best.max() > 0 else best
+    if best.max() == 0:
+        return best
+    apart = None if objects is None else torch.from_numpy(objects)
+    return merge_regions(image, torch.from_numpy(best), objects=apart).numpy()
 
 
-def _felzenszwalb_regions(image: Tensor, scale: float, min_size: int) -> Labels:
+def _felzenszwalb_regions(image: Tensor, scale: float, min_size: int, objects: Labels | None) -> Labels:
     """Return 4-connected regions of (3, H, W), of at least ``min_size`` pixels, contours on edges."""
     from skimage.segmentation import felzenszwalb
 
@@ -84,7 +137,7 @@ def _felzenszwalb_regions(image: Tensor, scale: float, min_size: int) -> Labels:
     smallest = max(1, round(min_size * small[0].numel() / image[0].numel()))
     # Lab over 100 has about the range of RGB in [0, 1], for which scales are usually given
     raw = felzenszwalb(rgb_to_lab(small) / 100, scale=scale, sigma=_SIGMA, min_size=smallest)
-    return clean(_enlarge(image, clean(raw, smallest)), min_size)
+    return clean(_enlarge(image, clean(raw, smallest)), min_size, objects)
 
 
 def _shrink(image: Tensor) -> float:
@@ -94,12 +147,17 @@ def _shrink(image: Tensor) -> float:
 def _enlarge(image: Tensor, regions: Labels) -> Labels:
     """Return regions at the size of (3, H, W), with contours on its edges."""
     if regions.shape != image.shape[1:]:
-        maps = torch.from_numpy(regions)[None, None].double()
-        regions = to_regions(F.interpolate(maps, image.shape[1:], mode="nearest")[0, 0].long().numpy())
+        regions = to_regions(_resize(regions, image.shape[1:]))
     return snap_contours(rgb_to_lab(image), regions, math.ceil(2 * _shrink(image)))
 
 
-def _refine(coarse: Labels, fine: Labels, min_size: int) -> Labels:
+def _resize(labels: Labels, size: tuple[int, ...]) -> Labels:
+    """Return a map at another size, each pixel with the label of the nearest one."""
+    maps = torch.from_numpy(labels)[None, None].double()
+    return F.interpolate(maps, size, mode="nearest")[0, 0].long().numpy()
+
+
+def _refine(coarse: Labels, fine: Labels, min_size: int, objects: Labels | None) -> Labels:
     """Divide regions of ``coarse`` by the regions of ``fine`` that lie within one of them.
 
     The coarse map has the better contours: a region of the finer map that crosses them is left out.
@@ -108,7 +166,7 @@ def _refine(coarse: Labels, fine: Labels, min_size: int) -> Labels:
     overlap = np.bincount((fine * count + coarse).ravel(), minlength=count * (int(fine.max()) + 1)).reshape(-1, count)
     parent = overlap.argmax(axis=1)
     is_part = overlap.max(axis=1) > _PART_SHARE * np.bincount(fine.ravel())
-    return clean(np.where(is_part[fine] & (parent[fine] == coarse), count + fine, coarse), min_size)
+    return clean(np.where(is_part[fine] & (parent[fine] == coarse), count + fine, coarse), min_size, objects)
 
 
 def _spread(image: Tensor, regions: Labels) -> float:

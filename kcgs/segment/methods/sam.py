@@ -1,7 +1,6 @@
 """Segment Anything and SAM 2 by transformers, prompted by points, boxes or a grid."""
 
 import os
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -11,6 +10,7 @@ from torch import Tensor
 from kcgs._check import check_count, check_number
 from kcgs.errors import InvalidArgument
 from kcgs.segment.cleanup import Prediction
+from kcgs.segment.cutting import NAMES
 from kcgs.segment.networks import load_pretrained, preprocess
 from kcgs.segment.prompts import Points, Prompt, check_prompt
 from kcgs.segment.registry import register
@@ -29,8 +29,6 @@ def sam(
     image: Tensor,
     *,
     model: str | os.PathLike[str] | Any = "facebook/sam2.1-hiera-tiny",
-    boxes: Tensor | Sequence[Any] | None = None,
-    points: Tensor | Sequence[Any] | None = None,
     box: Points | None = None,
     foreground: Points | None = None,
     background: Points | None = None,
@@ -39,23 +37,21 @@ def sam(
 ) -> Prediction:
     """Segment by Segment Anything (Kirillov et al., ICCV 2023) or SAM 2 (Ravi et al., ICLR 2025).
 
-    A box, or a set of points, asks for one object and gets its best mask; so do ``box``, ``foreground`` and
-    ``background`` together, as for the method ``grabcut``. Without any, a grid of points asks for everything: of the
-    three masks per point those are taken that the model scores at least ``min_score`` and that hardly depend on the
-    threshold. Of two masks that overlap by more than 0.7 (intersection over union) the better is taken. Smaller masks
-    lie over larger ones. Each connected piece that no mask covers is a region too. The score of a region is the overlap
-    that the model predicts for its mask, NaN without a mask.
+    A box, points of an object, or both ask for this object and get its best mask. Without them, a grid of points asks
+    for everything: of the three masks per point those are taken that the model scores at least ``min_score`` and that
+    hardly depend on the threshold. Of two masks that overlap by more than 0.7 (intersection over union) the better is
+    taken. Smaller masks lie over larger ones. Each connected piece that no mask covers is a region too. The score of a
+    region is the overlap that the model predicts for its mask, NaN without a mask. With a prompt the names of
+    regions are "object" and "background".
 
     Args:
         image: as `segment` takes it, any size.
         model: a hub id such as "facebook/sam2.1-hiera-tiny" or "facebook/sam-vit-base", a local folder, or a loaded
             ``SamModel`` or ``Sam2Model``.
-        boxes: :math:`(K, 4)` left, top, right, bottom in pixels; a tensor or a list.
-        points: :math:`(K, P, 2)` for K objects of P points each, (x, y) in pixels; a tensor or a list.
         box: left, top, right, bottom of one object, in pixels.
-        foreground: :math:`(P, 2)` points (x, y) of it.
+        foreground: :math:`(P, 2)` points (x, y) of the object, in pixels, in the box if there is one.
         background: :math:`(P, 2)` points (x, y) that are not of it.
-        grid: points along each side where there is none of these, at least 1.
+        grid: points along each side where there is no prompt, at least 1.
         min_score: of the grid's masks, in [0, 1], against the overlap that the model predicts.
 
     Raises:
@@ -67,19 +63,15 @@ def sam(
     check_count("grid", grid)
     check_number("min_score", min_score, 0, 1)
     prompt = check_prompt(image, box, foreground, background)
-    is_grid = False
-    if prompt.box is not None or prompt.foreground or prompt.background:
-        prompts = _object_prompts(prompt, boxes, points)
-    else:
-        is_grid = boxes is None and points is None
-        prompts = _prompts(boxes, _grid_points(image, grid) if is_grid else points)
+    is_grid = prompt.box is None and not prompt.clicks
+    inputs = _grid_inputs(image, grid) if is_grid else _prompt_inputs(prompt)
     network = load_pretrained("AutoModelForMaskGeneration", model, image.device)
     side, (height, width) = network.prompt_encoder.input_image_size, image.shape[1:]
     size = (side, side)
     if network.config.model_type == "sam":  # its input keeps the image's shape, in a corner of the square
         size = (round(height * side / max(height, width)), round(width * side / max(height, width)))
     square = F.pad(preprocess(image, size), (0, side - size[1], 0, side - size[0]))
-    logits, scores = _predict_masks(network, square, prompts, torch.tensor([size[1] / width, size[0] / height]))
+    logits, scores = _predict_masks(network, square, inputs, torch.tensor([size[1] / width, size[0] / height]))
     if is_grid:
         logits, scores = logits.flatten(0, 1), scores.flatten()
         inner, outer = ((logits > offset).flatten(1).sum(dim=1) for offset in (_STABILITY_OFFSET, -_STABILITY_OFFSET))
@@ -96,51 +88,27 @@ def sam(
         inside = F.interpolate(corner, (height, width), mode="bilinear", align_corners=False)[0, 0] > 0
         labels[inside] = label
         pixel_scores[inside] = scores[mask]
-    return Prediction(labels, pixel_scores)
+    return Prediction(labels, pixel_scores, None if is_grid else NAMES)
 
 
-def _prompts(boxes: Any, points: Any) -> dict[str, Tensor]:
-    """Return boxes or points as the network's inputs, (1, K, ...)."""
-    if boxes is not None:
-        if points is not None:
-            raise ValueError("boxes must be None where there are points; got both")
-        return {"input_boxes": _to_tensor("boxes", boxes, (None, 4))[None]}
-    points = _to_tensor("points", points, (None, None, 2))[None]
-    return {"input_points": points, "input_labels": torch.ones(points.shape[:3]).long()}
-
-
-def _object_prompts(prompt: Prompt, boxes: Any, points: Any) -> dict[str, Tensor]:
+def _prompt_inputs(prompt: Prompt) -> dict[str, Tensor]:
     """Return the prompt of one object as the network's inputs, (1, 1, ...)."""
-    for name, values in (("boxes", boxes), ("points", points)):
-        if values is not None:
-            raise InvalidArgument(name, "None with box, foreground or background", "both")
     if prompt.box is None and not prompt.foreground:
         raise InvalidArgument("foreground", "given where there is no box", "none")
     inputs: dict[str, Tensor] = {}
     if prompt.box is not None:
         inputs["input_boxes"] = torch.tensor([[prompt.box]])
-    if clicks := prompt.foreground + prompt.background:
-        inputs["input_points"] = torch.tensor([[clicks]])
-        inputs["input_labels"] = torch.tensor([[[1] * len(prompt.foreground) + [0] * len(prompt.background)]])
+    if prompt.clicks:
+        inputs["input_points"] = torch.tensor([[[point for point, _ in prompt.clicks]]])
+        inputs["input_labels"] = torch.tensor([[[label for _, label in prompt.clicks]]])
     return inputs
 
 
-def _to_tensor(name: str, values: Any, shape: tuple[int | None, ...]) -> Tensor:
-    """Return a tensor, or a list from the command line, as a tensor of a shape; None: any size."""
-    expected = f"{name} must be numbers of shape ({', '.join('any' if n is None else str(n) for n in shape)})"
-    try:
-        tensor = torch.as_tensor(values, dtype=torch.float32)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"{expected}; got {values!r}") from error
-    fits = tensor.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, tensor.shape, strict=True))
-    if not fits or not tensor.numel():
-        raise ValueError(f"{expected}; got {tuple(tensor.shape)}")
-    return tensor
-
-
-def _grid_points(image: Tensor, grid: int) -> Tensor:
+def _grid_inputs(image: Tensor, grid: int) -> dict[str, Tensor]:
+    """Return the points of a grid as the network's inputs, (1, K, 1, ...)."""
     steps = (torch.arange(grid) + 0.5) / grid
-    return torch.cartesian_prod(steps * image.shape[1], steps * image.shape[2]).flip(-1)[:, None]
+    points = torch.cartesian_prod(steps * image.shape[1], steps * image.shape[2]).flip(-1)[None, :, None]
+    return {"input_points": points, "input_labels": torch.ones(points.shape[:3], dtype=torch.int64)}
 
 
 @torch.no_grad()

@@ -1,0 +1,216 @@
+"""One object, cut out by a box or a mask and clicks: GrabCut, by OpenCV."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor
+
+from kcgs._warn import warn_user
+from kcgs.segment.cleanup import Prediction, merge_small
+from kcgs.segment.images import reduce_image, rgb_to_lab, to_pixels
+from kcgs.segment.prompts import Box, Point, Prompt
+from kcgs.segment.snapping import snap_contours
+
+# Tuned by the overlap with masks of DAVIS, from boxes and from masks of ISNet: `python -m benchmarks.objects`.
+# around the box, what GrabCut sees of the background, in sides of the box
+_MARGIN = 0.3
+# pixels at which an object is segmented, at most; more give no better masks
+_MAX_PIXELS = 60_000
+# steps from the box, and from each click
+_BOX_STEPS = 5
+_CLICK_STEPS = 3
+# least and largest depth of a click in what it corrects, in sides of the box
+_LEAST_DEPTH = 0.03
+_MOST_DEPTH = 0.15
+# radius around a click of what surely has its label, in depths
+_SURE = 0.5
+# radius of what has its label to begin with, in depths
+_CHANGED = 1.5
+# radius of what may change, in depths
+_OPEN = 3.0
+# least radius of what may change, in sides of the box
+_LEAST_OPEN = 0.1
+# radius of what GrabCut sees around a click, in radii of what may change
+_SEEN = 1.5
+# pieces and holes of a smaller share of the box and its margin vanish
+_LEAST_PIECE = 0.002
+# pixels of the reduced image around a change, where the contour at full size changes with it
+_FRINGE = 2
+# modes and labels of OpenCV; the lowest bit of a label is set for the object
+_INIT_WITH_MASK = 1
+_BACKGROUND, _OBJECT, _PERHAPS_BACKGROUND, _PERHAPS_OBJECT = 0, 1, 2, 3
+
+NAMES = ["background", "object"]
+
+Mask = NDArray[np.uint8]
+
+
+def cut_from_box(image: Tensor, box: Box, prompt: Prompt) -> Prediction:
+    """Cut an object out of an image (3, H, W) in [0, 1]: what differs from the colours around a box, and its clicks.
+
+    Raises:
+        ValueError: no object is found.
+
+    Warns:
+        UserWarning: a click that the mask does not follow.
+    """
+    crop = _Crop(image, box)
+    mask = _follow_clicks(crop, _cut_box(crop), prompt)
+    labels = torch.zeros(image.shape[1:], dtype=torch.int64)
+    labels[crop.window] = crop.enlarge(mask)
+    return _check_result(labels, prompt)
+
+
+def correct_mask(image: Tensor, mask: Tensor, prompt: Prompt) -> Prediction:
+    """Correct the mask of an object, (H, W) bool, by clicks; errors and warnings are those of `cut_from_box`."""
+    labels = mask.long()
+    if prompt.clicks:
+        crop = _Crop(image, prompt.box or _bounds(mask, prompt))
+        before = crop.reduce(mask)
+        after = _follow_clicks(crop, before, prompt)
+        reach = math.ceil(_FRINGE / min(crop.scale))
+        changed = F.interpolate(torch.from_numpy(before != after)[None, None].float(), crop.image.shape[1:])
+        is_near = F.max_pool2d(changed, 2 * reach + 1, 1, reach)[0, 0] > 0
+        labels[crop.window] = torch.where(is_near, crop.enlarge(after), labels[crop.window])
+    return _check_result(labels, prompt)
+
+
+def _bounds(mask: Tensor, prompt: Prompt) -> Box:
+    """Return the box of a mask and of the clicks."""
+    y, x = (places.tolist() for places in mask.nonzero().T)
+    x += [click_x for (click_x, _), _ in prompt.clicks]
+    y += [click_y for (_, click_y), _ in prompt.clicks]
+    return min(x), min(y), max(x) + 1.0, max(y) + 1.0
+
+
+def _check_result(labels: Tensor, prompt: Prompt) -> Prediction:
+    if not labels.any():
+        raise ValueError("no object is found: give another box, or a point of the object as foreground")
+    for (x, y), label in prompt.clicks:
+        if labels[int(y), int(x)] != label:
+            warn_user(f"the click at {x:g}, {y:g} is not in the {NAMES[label]}: colours, or another click, say no")
+    return Prediction(labels, names=NAMES)
+
+
+class _Crop:
+    """The part of an image around a box, at its own size and reduced."""
+
+    def __init__(self, image: Tensor, box: Box) -> None:
+        height, width = image.shape[1:]
+        self.window = _window(box[1], box[3], height), _window(box[0], box[2], width)
+        self.image = image.cpu()[:, *self.window]
+        small = reduce_image(self.image.permute(1, 2, 0).contiguous().permute(2, 0, 1), _MAX_PIXELS)
+        self.pixels: NDArray[np.uint8] = np.round(to_pixels(small) * 255).astype(np.uint8)
+        self.scale = small.shape[2] / self.image.shape[2], small.shape[1] / self.image.shape[1]
+        left, top, right, bottom = (*self.to_crop(box[:2]), *self.to_crop(box[2:]))
+        self.box = left, top, right, bottom
+        self.side = math.sqrt((right - left) * (bottom - top))
+
+    def to_crop(self, point: Point) -> Point:
+        """Return a point of the image in pixels of the reduced crop."""
+        rows, columns = self.window
+        return (point[0] - columns.start) * self.scale[0], (point[1] - rows.start) * self.scale[1]
+
+    def reduce(self, mask: Tensor) -> Mask:
+        """Return a mask of the image, (H, W) bool, at the size of the reduced crop."""
+        small = F.interpolate(mask[self.window][None, None].float(), self.pixels.shape[:2], mode="area")
+        return (small[0, 0] > 0.5).numpy().astype(np.uint8)
+
+    def enlarge(self, mask: Mask) -> Tensor:
+        """Return a mask at the crop's own size, without small pieces and holes, with its contours on edges."""
+        soft = torch.from_numpy(mask)[None, None].float()
+        large = (F.interpolate(soft, self.image.shape[1:], mode="bilinear")[0, 0] > 0.5).numpy().astype(np.int64)
+        large = merge_small(large, max(1, round(_LEAST_PIECE * large.size)))
+        if large.min() != large.max():
+            large = snap_contours(rgb_to_lab(self.image), large, math.ceil(1 / max(self.scale)))
+        return torch.from_numpy(large)
+
+
+def _window(low: float, high: float, size: int) -> slice:
+    """Return the pixels of one axis that matter: those of the box, with a margin."""
+    margin = _MARGIN * (high - low) + 1
+    return slice(max(0, math.floor(low - margin)), min(size, math.ceil(high + margin)))
+
+
+def _cut_box(crop: _Crop) -> Mask:
+    """Return where the object of the box is, (h, w) of 0 and 1: what has other colours than what is around the box."""
+    left, top, right, bottom = crop.box
+    labels = np.full(crop.pixels.shape[:2], _BACKGROUND, dtype=np.uint8)
+    labels[math.floor(top) : math.ceil(bottom), math.floor(left) : math.ceil(right)] = _PERHAPS_OBJECT
+    return _run(crop.pixels, labels, _BOX_STEPS)
+
+
+def _follow_clicks(crop: _Crop, mask: Mask, prompt: Prompt) -> Mask:
+    """Return a mask in which every click has changed what lies around it and is connected with it."""
+    clicks = [(crop.to_crop(point), label) for point, label in prompt.clicks]
+    left, top, right, bottom = crop.box
+    clicks = [((x, y), label) for (x, y), label in clicks if label or (left <= x < right and top <= y < bottom)]
+    sure = np.full(mask.shape, _PERHAPS_OBJECT, dtype=np.uint8)
+    for point, label in clicks:
+        sure[_distances(mask, point) <= _SURE * _depth(mask, point, label, crop.side)] = label
+    for point, label in clicks:
+        mask = np.where(_change(crop, mask, sure, point, label), label, mask).astype(np.uint8)
+    return mask
+
+
+def _change(crop: _Crop, mask: Mask, sure: Mask, point: Point, label: int) -> NDArray[np.bool_]:
+    """Return where a click gives its label to pixels that have the other one."""
+    from scipy import ndimage
+
+    depth = _depth(mask, point, label, crop.side)
+    distances, radius = _distances(mask, point), max(_OPEN * depth, _LEAST_OPEN * crop.side)
+    labels = mask + _PERHAPS_BACKGROUND
+    labels[distances < _CHANGED * depth] = label + _PERHAPS_BACKGROUND
+    labels = np.where(distances > radius, mask, labels)
+    labels = np.where(sure <= _OBJECT, sure, labels)
+    window = (
+        *(
+            slice(max(0, math.floor(center - _SEEN * radius)), math.ceil(center + _SEEN * radius))
+            for center in (point[1], point[0])
+        ),
+    )
+    result = mask.copy()
+    result[window] = _run(crop.pixels[window], labels[window], _CLICK_STEPS)
+    is_changed: NDArray[np.bool_] = (result == label) & (mask != label)
+    pieces = np.asarray(ndimage.label(is_changed | (distances <= _SURE * depth))[0])
+    is_changed &= pieces == pieces[math.floor(point[1]), math.floor(point[0])]
+    return is_changed
+
+
+def _run(pixels: NDArray[np.uint8], labels: Mask, steps: int) -> Mask:
+    """Run GrabCut from labels of OpenCV, (h, w), and return where the object is."""
+    try:
+        import cv2
+    except ImportError as error:
+        raise ImportError(
+            "this method needs the package opencv-python-headless: pip install 'kcgs[grabcut]'"
+        ) from error
+    labels = np.ascontiguousarray(labels)
+    if len(np.unique(labels & 1)) == 2:  # else there is nothing to tell apart
+        cv2.setRNGSeed(0)  # of the k-means that it begins with
+        models = np.zeros((1, 65)), np.zeros((1, 65))
+        # no rectangle, for the labels say what it would
+        cv2.grabCut(np.ascontiguousarray(pixels), labels, (0, 0, 0, 0), models[0], models[1], steps, _INIT_WITH_MASK)
+    return np.asarray(labels & 1, dtype=np.uint8)
+
+
+def _distances(mask: Mask, point: Point) -> NDArray[np.float64]:
+    """Return the distance of each pixel from that of a point."""
+    y, x = (np.arange(n) for n in mask.shape)
+    return np.hypot(x - math.floor(point[0]), (y - math.floor(point[1]))[:, None])
+
+
+def _depth(mask: Mask, point: Point, label: int, side: float) -> float:
+    """Return the distance from a click to the nearest contour, which tells how much is wrong around it."""
+    from scipy.ndimage import distance_transform_edt
+
+    y, x = math.floor(point[1]), math.floor(point[0])
+    if mask[y, x] == label:
+        return _LEAST_DEPTH * side
+    distance = float(distance_transform_edt(np.pad(mask != label, 1))[y + 1, x + 1])
+    return min(max(distance, _LEAST_DEPTH * side), _MOST_DEPTH * side)
