@@ -2,26 +2,34 @@
 
 from __future__ import annotations
 
+import math
 from itertools import product
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, one_hot, pad
+from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, one_hot, pad, unfold
 
-# side of the blocks that are compared, in pixels
-_BLOCK = 4
-# blocks around a part of the unknown ones that are compared
-_RING = 4
-# blocks around a block whose errors are averaged
-_WINDOW = 2
-# a hole is cut into parts of the size of this share of it, each with a place of its own
-_PART = 1 / 8
-# mean squared error, summed over channels, from which on no place is copied
-_LARGEST_ERROR = 0.2
+from .montage import choose_layers
+
+# pixels of a hole in which places are chosen: larger holes are reduced
+_MAX_PIXELS = 2_000
+# half the side of the patches by which an image repeats itself, in reduced pixels
+_HALF_PATCH = 3
+# patches that are compared with all others, and of them at a time
+_PATCHES = 1_500
+_CHUNK = 250
+# offsets by which patches repeat that are tried
+_REPETITIONS = 60
+# of a hole and what is around it: offsets of a smaller share of its longer side do not count as repetitions
+_LEAST_OFFSET = 1 / 15
+# cost of a pixel that continues its surroundings smoothly, where seams cost the difference of their sides
+_SMOOTH_COST = 0.1
+# cost of a pixel without a copy, as its place is unknown or beyond the image
+_UNKNOWN_COST = 50.0
 # weight of the difference of a copy and the smooth continuation: conspicuous things are not copied
-_SMOOTH_WEIGHT = 0.2
-# blocks over which copies of two places are blended
-_BLEND = 2
+_SMOOTH_WEIGHT = 0.02
+# reduced pixels over which copies of two places are blended
+_BLEND = 1
 # largest difference of image and copy that is continued; with more, an edge that only one of them has tints the hole
 _LARGEST_DIFFERENCE = 0.1
 
@@ -35,64 +43,89 @@ def inpaint(image: Tensor, unknown: Tensor) -> Tensor:
 
 
 def inpaint_from_matches(image: Tensor, unknown: Tensor) -> Tensor:
-    """Copy places that look like the surroundings into unknown pixels.
+    """Copy other places of the image into unknown pixels, so that seams are seen least.
 
-    Each part of the unknown pixels finds a place, and each pixel copies the place whose error in the surroundings,
-    smoothly continued, is the least. Copies are shifted by a smooth continuation of the difference around them. Without
-    such a place it is `inpaint`.
+    The places lie at offsets by which the image repeats itself around the hole, or beside the hole. Copies are shifted
+    by a smooth continuation of the difference around them. Where no copy fits, pixels continue their surroundings
+    smoothly, as `inpaint` does.
+
+    Source: He and Sun, "Statistics of patch offsets for image completion", 2012.
     """
     height, width = unknown.shape
     smooth = inpaint(image, unknown)
-    blocks = avg_pool2d(smooth, _BLOCK, ceil_mode=True)
-    hole = max_pool2d(unknown[None].to(image), _BLOCK, ceil_mode=True)[0]
-    offsets = _matches(blocks, hole)
-    costs = torch.stack([torch.full_like(hole, _LARGEST_ERROR), *(_cost(blocks, hole, *o) for o in offsets)])
-    shares = one_hot(costs.argmin(0), len(costs)).movedim(-1, 0).to(image)
+    reduction = max(1, round(math.sqrt(float(unknown.sum()) / _MAX_PIXELS)))
+    small = avg_pool2d(smooth, reduction, ceil_mode=True)
+    hole = max_pool2d(unknown[None].to(image), reduction, ceil_mode=True)[0] > 0
+    offsets = _offsets(small, hole)
+    layers = torch.stack([small, *(_shift(small, offset) for offset in offsets)])
+    costs = _SMOOTH_WEIGHT * (layers - small).norm(dim=1)
+    costs[0] = _SMOOTH_COST
+    for cost, offset in zip(costs[1:], offsets, strict=True):
+        cost[~_has_source(hole, offset)] = _UNKNOWN_COST
+    labels = choose_layers(layers, costs, hole)
+    shares = one_hot(labels, len(layers)).movedim(-1, 0).to(image)
     shares = avg_pool2d(shares, 2 * _BLEND + 1, 1, _BLEND, count_include_pad=False)
-    shares = interpolate(shares[None], scale_factor=_BLOCK, mode="bilinear")[0, :, None, :height, :width]
-    copy = shares[0] * smooth
-    for share, (dy, dx) in zip(shares[1:], offsets, strict=True):
-        copy += share * smooth.roll((-_BLOCK * dy, -_BLOCK * dx), (-2, -1))
+    copy = torch.zeros_like(image)
+    for share, (dy, dx) in zip(shares, [(0, 0), *offsets], strict=True):
+        if share.any():
+            share = interpolate(share[None, None], scale_factor=reduction, mode="bilinear")[0, 0, :height, :width]
+            copy += share * _shift(smooth, (reduction * dy, reduction * dx))
     difference = (image - copy).clamp(-_LARGEST_DIFFERENCE, _LARGEST_DIFFERENCE)
     return torch.where(unknown, copy + inpaint(difference, unknown), image)
 
 
-def _matches(blocks: Tensor, hole: Tensor) -> list[tuple[int, int]]:
-    """Return the rows and columns from each part of a hole to the place that differs least from what is around it."""
-    height, width = hole.shape
-    side = max(_RING, round((_PART * float(hole.sum())) ** 0.5))
-    known, squares, shape = 1 - hole, blocks.square().sum(0), (2 * height, 2 * width)
-    spectra = torch.fft.rfft2(torch.cat([torch.stack([known, known * squares]), known * blocks]), s=shape)
-    offsets = set()
-    for y, x in product(range(0, height, side), range(0, width, side)):
-        cell = slice(y, y + side), slice(x, x + side)
-        if not hole[cell].any():
-            continue
-        part = torch.zeros_like(hole)
-        part[cell] = hole[cell]
-        ring = known * max_pool2d(part[None], 2 * _RING + 1, 1, _RING)[0]
-        if not ring.any():
-            continue
-        # correlated, the sum of (blocks - place)^2 - _LARGEST_ERROR over known blocks of the place, for each offset
-        factors = torch.stack([ring * squares - _LARGEST_ERROR * (ring + part), ring])
-        factors = torch.fft.rfft2(torch.cat([factors, -2 * ring * blocks]), s=shape).conj()
-        error = torch.fft.irfft2((factors * spectra).sum(0), s=shape)
-        dy, dx = divmod(int(error.argmin()), shape[1])
-        offsets.add((dy - shape[0] * (dy >= height), dx - shape[1] * (dx >= width)))
-    return sorted(offsets)
+def _shift(image: Tensor, offset: tuple[int, int]) -> Tensor:
+    """Return an image (..., H, W) that shows at each pixel what is at an offset (rows, columns) from it."""
+    return image.roll((-offset[0], -offset[1]), (-2, -1))
 
 
-def _cost(blocks: Tensor, hole: Tensor, dy: int, dx: int) -> Tensor:
-    """Return the error of the place at an offset for each block, (H, W): infinite where the place is unknown."""
-    known = 1 - hole
-    source = pad(known, (-min(dx, 0), max(dx, 0), -min(dy, 0), max(dy, 0)))
-    source = source[max(dy, 0) :, max(dx, 0) :][: hole.shape[0], : hole.shape[1]]
-    error = (blocks - blocks.roll((-dy, -dx), (-2, -1))).square().sum(0)
-    both = torch.stack([known * source, known * source * error, hole * error])
-    share, around, inside = avg_pool2d(both, 2 * _WINDOW + 1, 1, _WINDOW)
-    cost = inpaint((around / share.clamp_min(1e-9))[None], (hole > 0) | (share < 1e-9))[0] + _SMOOTH_WEIGHT * inside
-    lost = max_pool2d(1 - source[None], 2 * _BLEND + 3, 1, _BLEND + 1)[0] > 0
-    return torch.where(lost | ~share.any(), torch.inf, cost)
+def _has_source(hole: Tensor, offset: tuple[int, int]) -> Tensor:
+    """Return which pixels have a known one at an offset, (H, W) bool."""
+    inside = pad(~hole, (-min(offset[1], 0), max(offset[1], 0), -min(offset[0], 0), max(offset[0], 0)))
+    return inside[max(offset[0], 0) :, max(offset[1], 0) :][: hole.shape[0], : hole.shape[1]]
+
+
+def _offsets(image: Tensor, hole: Tensor) -> list[tuple[int, int]]:
+    """Return offsets (rows, columns) of places to copy: repetitions of the image, and the eight beside the hole."""
+    rows, columns = (int(places.max() - places.min()) + 1 for places in hole.nonzero().T)
+    beside = {(rows * down, columns * right) for down, right in product((-1, 0, 1), repeat=2)} - {(0, 0)}
+    return sorted({*_repetitions(image, hole), *beside})
+
+
+def _repetitions(image: Tensor, hole: Tensor) -> list[tuple[int, int]]:
+    """Return the offsets (rows, columns) from most patches around a hole to those that look most like them."""
+    y, x = hole.nonzero().T
+    rows, columns = _surroundings(y, hole.shape[0]), _surroundings(x, hole.shape[1])
+    image, hole = image[:, rows, columns], hole[rows, columns]
+    (height, width), side = hole.shape, 2 * _HALF_PATCH + 1
+    if min(height, width) <= side:
+        return []
+    patches = unfold(image[None], side)[0].T
+    known = (max_pool2d(hole[None].to(image), side, 1)[0].flatten() == 0).nonzero().flatten()
+    if len(known) < 2:
+        return []
+    y, x = known // (width - side + 1), known % (width - side + 1)
+    targets = patches[known]
+    squares = targets.square().sum(1)
+    histogram = image.new_zeros(2 * height + 1, 2 * width + 1)
+    for chosen in torch.arange(0, len(known), max(1, len(known) // _PATCHES), device=known.device).split(_CHUNK):
+        errors = squares - 2 * targets[chosen] @ targets.T
+        dy, dx = y - y[chosen, None], x - x[chosen, None]
+        errors[dy.square() + dx.square() < (_LEAST_OFFSET * max(height, width)) ** 2] = torch.inf
+        best = errors.argmin(1, keepdim=True)
+        dy, dx = dy.gather(1, best)[:, 0], dx.gather(1, best)[:, 0]
+        for sign in (1, -1):
+            histogram.index_put_((height + sign * dy, width + sign * dx), histogram.new_ones(()), accumulate=True)
+    counts = avg_pool2d(histogram[None], 3, 1, 1)
+    counts = torch.where(counts == max_pool2d(counts, 5, 1, 2), counts, 0)[0].flatten()
+    best = counts.topk(min(_REPETITIONS, int((counts > 0).sum()))).indices
+    return [(int(i) // (2 * width + 1) - height, int(i) % (2 * width + 1) - width) for i in best]
+
+
+def _surroundings(places: Tensor, size: int) -> slice:
+    """Return the rows or columns from those of a hole less its extent to those of the hole plus its extent."""
+    low, high = int(places.min()), int(places.max()) + 1
+    return slice(max(0, 2 * low - high), min(size, 2 * high - low))
 
 
 def _pull_push(image: Tensor, weight: Tensor) -> Tensor:
