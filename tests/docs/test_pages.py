@@ -19,6 +19,7 @@ import kcgs
 from kcgs.cli import app
 from kcgs.segment import registry
 from kcgs.video import read_video, write_video
+from tests.segment.test_onnx import write_mixer
 
 ROOT = Path(kcgs.__file__).resolve().parent.parent
 if not (ROOT / "docs/conf.py").is_file():
@@ -102,8 +103,10 @@ def test_commands_are_taken(page: Path) -> None:
 
 
 @pytest.mark.slow
-def test_readme_commands_run(folder: Path) -> None:
-    """In a row, as a reader would type them."""
+def test_readme_commands_run(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a row, as a reader would type them; in place of the downloaded network a small one finds what is bright."""
+    write_mixer(tmp_path / "isnet-general-use.onnx", [[4.0, 4.0, 4.0]])
+    monkeypatch.setenv("U2NET_HOME", str(tmp_path))
     group: Any = get_command(app)
     videos = importlib.util.find_spec("av") is not None
     if videos:
