@@ -10,7 +10,7 @@ from .core.run import Options, run_experiment
 # modules of this package with `jobs`, `measure` and `page`
 EXPERIMENTS = (
     "quality", "convergence", "published", "ablation", "rate", "pairs", "previews", "maps", "labels", "enlarge", "fill",
-    "video", "batch", "loading", "render", "gpu", "gpu-fit", "decode",
+    "video", "batch", "many", "loading", "render", "gpu", "gpu-fit", "decode",
 )  # fmt: skip
 
 

@@ -1,0 +1,148 @@
+"""What do tens of thousands of Gaussians give, and how does the time of a fit grow with them?"""
+
+from __future__ import annotations
+
+import os
+import time
+from functools import cache
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kcgs import FitConfig, fit
+from kcgs.fitting import precompile
+
+from .core.clocks import peak_megabytes, threads
+from .core.compare import group_by, means_table
+from .core.cuda import megabytes, synchronize
+from .core.figures import Panel, save_lines
+from .core.fits import QUICK_ITERATIONS
+from .core.goals import Goal, goals_table, missed_goals
+from .core.images import choose, load
+from .core.run import Job, Options, Page, Row
+
+COUNTS = (10_000, 30_000, 50_000, 70_000)
+QUICK_COUNTS = (100, 200)
+# images of four photos of Kodak
+LARGE = tuple(f"2 x 2 photos, {k + 1}" for k in range(8))
+# all photos of Kodak in one image
+HUGE, HUGE_COUNT = "4 x 6 photos", 300_000
+CPU, GPU = "CPU", "GPU"
+# of Kodak on a GPU: N, dB and seconds
+GOAL = (50_000, 48.5, 2.0)
+# N, dB and seconds on Kodak as printed, on GPUs
+PRINTED = {
+    "GaussianImage++": (10_000, 35.41, None), "Structure-Guided": (30_000, 40.51, 132.0),
+    "Fast-2DGS": (50_000, 43.13, 10.0), "SAD, sites of a soft Voronoi diagram": (50_000, 46.0, 2.2),
+    "Structure-Guided, 70,000": (70_000, 45.40, None),
+}  # fmt: skip
+METHOD = f"""`fit(image, None, N)` with its default settings, without compilation: the 24 photos of Kodak; images of
+four of them side by side, {len(LARGE)} of them; and one of all 24, 9.4 megapixels, with {HUGE_COUNT:,} Gaussians.
+Seconds are those of the call, on all cores of a CPU or on a GPU. MB is what a fit of the largest image adds at the
+peak. As printed, on GPUs: {
+    "; ".join(
+        f"{name} {psnr:g} dB at N = {n:,}" + (f" in {seconds:g} s" if seconds else "")
+        for name, (n, psnr, seconds) in PRINTED.items()
+    )
+}."""
+
+
+@cache
+def read(image: str, data: str, quick: bool) -> Tensor:
+    """Read a photo of Kodak, or put some side by side, upright ones turned."""
+    if image not in (*LARGE, HUGE):
+        return load(image, data, quick).image
+    names = choose(Options(Path(), Path(data) if data else None, quick), "kodak")
+    photos = [load(name, data, quick).image for name in names]
+    photos = [photo if photo.shape[2] >= photo.shape[1] else photo.mT for photo in photos]
+    rows, columns, first = (6, 4, 0) if image == HUGE else (2, 2, 3 * LARGE.index(image))
+    picked = [photos[(first + k) % len(photos)] for k in range(rows * columns)]
+    return torch.cat([torch.cat(picked[k : k + columns], 2) for k in range(0, len(picked), columns)], 1).contiguous()
+
+
+def measure(image: str, method: str, counts: list[int], data: str, quick: bool) -> list[Row]:
+    """Fit an image with ever more Gaussians."""
+    device = "cuda" if method == GPU else "cpu"
+    config = FitConfig(iterations=QUICK_ITERATIONS if quick else None)
+    pixels, rows = read(image, data, quick).to(device), []
+    with threads(os.cpu_count() or 1):
+        precompile(config, device)
+        for n in counts:
+            start = time.perf_counter()
+            result = fit(pixels, None, n, recipe=config)
+            synchronize()
+            rows.append(
+                {
+                    "image": image, "set": set_of(image), "method": method, "n": n, "psnr": result.psnr,
+                    "seconds": time.perf_counter() - start,
+                }
+            )  # fmt: skip
+    if image == HUGE:
+        action: Any = (fit_by_name, image, data, quick, method, config, max(counts))
+        rows[-1]["peak_MB"] = (
+            megabytes(lambda: action[0](*action[1:]))
+            if method == GPU
+            else peak_megabytes(*action, warm_up=("kodim01", data, quick, method, config, 100))
+        )
+    return rows
+
+
+def fit_by_name(image: str, data: str, quick: bool, method: str, config: FitConfig, n: int) -> None:
+    """Fit an image, for a clock of memory."""
+    fit(read(image, data, quick).to("cuda" if method == GPU else "cpu"), None, n, recipe=config)
+
+
+def set_of(image: str) -> str:
+    """Return which of the three sets of images has an image."""
+    return HUGE if image == HUGE else "2 x 2 photos" if image in LARGE else "Kodak"
+
+
+def jobs(options: Options) -> list[Job]:
+    """Fit all images on a CPU, and on a GPU where there is one."""
+    devices = [CPU, *([GPU] if torch.cuda.is_available() else [])]
+    images = choose(options, "kodak")
+    counts = {image: QUICK_COUNTS if options.quick else COUNTS for image in images}
+    if not options.quick and options.data is not None:
+        counts |= {image: COUNTS for image in LARGE} | {HUGE: (HUGE_COUNT,)}
+    return [
+        {"image": image, "method": method, "counts": counts[image], **options.image_arguments()}
+        for method in devices
+        for image in counts
+    ]
+
+
+def page(folder: Path, rows: list[Row]) -> Page:
+    """Write the report."""
+    panels = [
+        Panel(f"{method}, {quantity}", group, "n", quantity, ("log", "linear" if quantity == "psnr" else "log"))
+        for (method,), group in group_by([row for row in rows if row["set"] != HUGE], ["method"]).items()
+        for quantity in ("psnr", "seconds")
+    ]
+    save_lines(folder / "many.png", panels, "set", "n")
+    sentences, goals = [], []
+    for (images, method), group in group_by(rows, ["set", "method"]).items():
+        means = {
+            n: [fmean(row[quantity] for row in group if row["n"] == n) for quantity in ("psnr", "seconds")]
+            for n in sorted({int(row["n"]) for row in group})
+        }
+        few, many = min(means), max(means)
+        sentences.append(
+            f"{images} on {method}: {means[many][0]:.2f} dB at N = {many:,} in {means[many][1]:.1f} seconds."
+        )
+        if few < many:
+            grows = means[many][1] / means[few][1] / (many / few)
+            sentences.append(f"From N = {few:,} on, the time grows by {grows:.2f} of what N grows by.")
+        if images == "Kodak" and method == GPU and GOAL[0] in means:
+            psnr, seconds = means[GOAL[0]]
+            name = f"Kodak, N = {GOAL[0]:,}"
+            goals += [Goal(name, "psnr", GOAL[1], psnr, more_is_better=True), Goal(name, "seconds", GOAL[2], seconds)]
+    table = means_table(rows, ["set", "method"], "n", ("psnr", "seconds", "peak_MB"))
+    missing = "" if any(row["method"] == GPU for row in rows) else "No GPU was measured: that takes a CUDA device."
+    return Page(
+        "What do tens of thousands of Gaussians give?", " ".join(sentences), "many.png",
+        "\n\n".join([table, *(["Goals:", goals_table(goals)] if goals else [])]),
+        "\n\n".join(filter(None, [missed_goals(goals), missing])), METHOD,
+    )  # fmt: skip
