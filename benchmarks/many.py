@@ -104,7 +104,7 @@ def jobs(options: Options) -> list[Job]:
     """Fit all images on a CPU, and on a GPU where there is one."""
     devices = [CPU, *([GPU] if torch.cuda.is_available() else [])]
     images = choose(options, "kodak")
-    counts = {image: QUICK_COUNTS if options.quick else COUNTS for image in images}
+    counts: dict[str, tuple[int, ...]] = {image: QUICK_COUNTS if options.quick else COUNTS for image in images}
     if not options.quick and options.data is not None:
         counts |= {image: COUNTS for image in LARGE} | {HUGE: (HUGE_COUNT,)}
     return [
