@@ -135,6 +135,22 @@ class TestCompile:
         assert counts[0] == counts[2]
 
     @compiler_warnings
+    @pytest.mark.parametrize("softness", [0.0, 0.8])
+    def test_batches_of_any_number_with_maps_of_their_own(self, softness: float) -> None:
+        compiled = torch.compile(region_splat, backend="aot_eager", fullgraph=True, dynamic=True)
+        for batch, count in ((2, 3), (2, 5), (3, 7), (2, 2), (4, 4)):
+            labels = (torch.arange(SIZE[1]) > 5 + torch.arange(batch)[:, None, None]).long().expand(-1, *SIZE)
+            regions = RegionMap.from_labels(labels, softness)
+            field = GaussianField.stack(
+                [GaussianField.random(count, SIZE, regions=labels[k], seed=k) for k in range(batch)]
+            )
+            leaves = [t.detach().requires_grad_() for t in (field.means, field.cholesky, field.colors)]
+            image, eager = (splat(*leaves, field.region_ids, regions) for splat in (compiled, region_splat))
+            assert image.shape == (batch, 3, *SIZE) and torch.equal(image, eager)
+            gradients = (torch.autograd.grad(t.square().sum(), leaves) for t in (image, eager))
+            assert all(torch.equal(a, b) for a, b in zip(*gradients, strict=True))
+
+    @compiler_warnings
     @pytest.mark.parametrize("whole", [False, True])
     def test_modules_at_any_size(self, field: GaussianField, regions: RegionMap, whole: bool) -> None:
         scene, counts = Scene(field, regions), []
