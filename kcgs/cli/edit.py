@@ -37,6 +37,12 @@ def edit(
     no_fill: Annotated[
         bool, typer.Option("--no-fill", help="Do not paint what is uncovered anew: it shows streaks, or black.")
     ] = False,
+    margin: Annotated[
+        int | None, typer.Option(min=0, help="Pixels around a hole that are painted anew, too; 6 by default.")
+    ] = None,
+    strength: Annotated[
+        float | None, typer.Option(min=0, max=1, help="Share of the new colour of --recolor; 0.75 by default.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Delete, recolour and move regions of a scene, in this order; options may be repeated. `info` lists the regions.
@@ -48,21 +54,25 @@ def edit(
         raise typer.BadParameter("an edit needs --delete, --recolor or --move")
     colors = [_parse("recolor", "ID=COLOR, such as 2=#ff0000", text) for text in recolor or []]
     offsets = [_parse_move(text) for text in move or []]
-    if no_fill and not (delete or move):
-        exclude("--recolor alone", no_fill=True)
+    if not (delete or move):
+        exclude("--recolor alone", no_fill=no_fill or None, margin=margin)
+    if not recolor:
+        exclude("an edit without --recolor", strength=strength)
     from kcgs import editing, load, video
 
     edited = load(scene)
-    delete_region: Any = partial(editing.delete_region, fill=not no_fill)
-    move_region: Any = partial(editing.move_region, fill=not no_fill)
+    hole: dict[str, Any] = {"fill": not no_fill} | ({} if margin is None else {"margin": margin})
+    delete_region: Any = partial(editing.delete_region, **hole)
+    move_region: Any = partial(editing.move_region, **hole)
     if edited.field.means.ndim == 3:
-        exclude("a batch of scenes", no_fill=no_fill or None)
+        exclude("a batch of scenes", no_fill=no_fill or None, margin=margin)
         check_output(output, ".safetensors")
         delete_region, move_region = video.delete_from_video, video.move_in_video
     if delete:
         edited = _apply("delete", delete_region, edited, delete)
     for region, color in colors:
-        edited = _apply("recolor", editing.recolor_region, edited, region, color=color)
+        share = {} if strength is None else {"strength": strength}
+        edited = _apply("recolor", editing.recolor_region, edited, region, color=color, **share)
     for region, offset in offsets:
         edited = _apply("move", move_region, edited, region, offset)
     size = edited.save(output)

@@ -2,8 +2,9 @@
 
 from .inpainting import inpaint
 from .masks import check_offset, dilate, nearest_labels, shift_labels
+from .recoloring import recolor_region
 from .render import render_over, render_region
-from .scenes import delete_region, extract_region, move_region, recolor_region, replace_background
+from .scenes import delete_region, extract_region, move_region, replace_background
 from .selection import members_of, unique_region_ids
 
 # public; what else is imported here is for the other rooms of kcgs

@@ -29,7 +29,7 @@ from .inpainting import inpaint_from_matches
 from .masks import dilate
 
 # pixels around a region that may have colours of it, as edges in photos are blurred and masks are not exact
-_FRINGE = 6
+MARGIN = 6
 # half the width of gaps between such pixels that are filled, too
 _CLOSING = 8
 # Gaussians with a larger share of their weight in the hole are fitted; a higher threshold leaves traces of the object
@@ -49,13 +49,14 @@ _RATE = 0.07
 _COLOR_RATE = 0.015
 
 
-def fill_hole(scene: Scene, hole: Tensor, visible: Tensor) -> Scene:
+def fill_hole(scene: Scene, hole: Tensor, visible: Tensor, margin: int = MARGIN) -> Scene:
     """Fill a hole from its surroundings.
 
     Args:
         scene: with a map that covers the hole.
         hole: where regions were, :math:`(H, W)` bool.
         visible: the part of the hole to fill, of the same shape.
+        margin: pixels around it that are filled, too.
 
     Returns:
         The scene without the Gaussians of the hole. Gaussians that reach into the hole are fitted to what is around
@@ -63,7 +64,7 @@ def fill_hole(scene: Scene, hole: Tensor, visible: Tensor) -> Scene:
     """
     regions = scene.regions
     assert regions is not None
-    fill_mask = visible | _fringe(visible, regions.labels)
+    fill_mask = visible | _fringe(visible, regions.labels, margin)
     unknown = hole | fill_mask
     if not fill_mask.any():
         return scene
@@ -79,10 +80,10 @@ def fill_hole(scene: Scene, hole: Tensor, visible: Tensor) -> Scene:
         return Scene(join(fixed, _fit(fitted, regions, target, weight)), regions, scene.metadata)
 
 
-def _fringe(mask: Tensor, labels: Tensor) -> Tensor:
+def _fringe(mask: Tensor, labels: Tensor, width: int) -> Tensor:
     """Return the pixels near a mask and in its gaps, (H, W) bool, of the regions in it that go on farther away."""
     # with a margin, since gaps between the mask and the border of the image stay
-    margin = _FRINGE + _CLOSING
+    margin = width + _CLOSING
     wide = dilate(pad(mask, (margin,) * 4), margin)
     near = ~dilate(~wide, _CLOSING)[margin:-margin, margin:-margin]
     return near & torch.isin(labels, labels[mask].unique()) & torch.isin(labels, labels[~near].unique())

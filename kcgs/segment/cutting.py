@@ -90,7 +90,7 @@ def _bounds(mask: Tensor, prompt: Prompt) -> Box:
 
 def _check_result(labels: Tensor, prompt: Prompt) -> Prediction:
     if not labels.any():
-        raise ValueError("no object is found: give another box, or a point of the object as foreground")
+        raise ValueError("no object is found: give a box around it, or a point of it as foreground")
     for (x, y), label in prompt.clicks:
         if labels[int(y), int(x)] != label:
             warn_user(f"the click at {x:g}, {y:g} is not in the {NAMES[label]}: colours, or another click, say no")

@@ -20,7 +20,7 @@ from kcgs.editing import (
     render_region,
     replace_background,
 )
-from kcgs.functional import region_splat
+from kcgs.functional import PairSoftness, region_splat
 from kcgs.nn import scaled_gaussians
 from tests.tester import BaseTester
 
@@ -342,7 +342,10 @@ class TestRecolor:
             return float(luma(scene)[pixels].sort().values[math.ceil(0.9 * int(pixels.sum())) - 1])
 
         scene = recolor_region(scene, BOX, level / brightest())
-        changed, color = recolor_region(scene, BOX, color="#001a33"), torch.tensor([0.0, 26 / 255, 51 / 255])
+        changed, color = (
+            recolor_region(scene, BOX, color="#001a33", strength=1.0),
+            torch.tensor([0.0, 26 / 255, 51 / 255]),
+        )
         assert changed.num_gaussians == scene.num_gaussians + added
         ratio = 1 + (luma(scene)[pixels] - brightest()) / max(level, 0.25)
         torch.testing.assert_close(changed().detach()[:, pixels], color[:, None] * ratio, rtol=0, atol=1e-4)
@@ -360,9 +363,17 @@ class TestRecolor:
             torch.stack([x, y], -1) + 0.5, torch.stack([size, 0 * size, size], -1), levels[:, None].expand(-1, 3),
             labels[y, x], size=SIZE,
         )  # fmt: skip
-        changed = recolor_region(Scene(field, labels), BOX, color="red")().detach()[0, y, x]
+        changed = recolor_region(Scene(field, labels), BOX, color="red", strength=1)().detach()[0, y, x]
         assert changed.max() == pytest.approx(1.0, abs=1e-3) and changed.diff().min() >= -1e-4
         assert 0.74 < changed[int(0.9 * len(y))] < 0.9 and (changed[0] > 0.1) == is_flatter
+
+    def test_a_share_of_the_old_colour_stays(self) -> None:
+        scene = scene_of(MAPS["hard"]())
+        whole = recolor_region(scene, BOX, color="red", strength=1.0)().detach()
+        before = scene().detach()
+        for strength, options in ((0.75, {}), (0.2, {"strength": 0.2}), (0.0, {"strength": 0.0})):
+            mixed = recolor_region(scene, BOX, color="red", **options)().detach()
+            torch.testing.assert_close(mixed, before.lerp(whole, strength), rtol=0, atol=2e-5)
 
     def test_without_bias_no_gaussian_is_added(self) -> None:
         scene = scene_of(MAPS["hard"]())
@@ -427,6 +438,15 @@ class TestReplaceBackground:
         hard = replace_background(Scene(scene.field, map_of(scene).labels), [GROUND, BOX], other)
         outside = map_of(scene).labels != DISC
         torch.testing.assert_close(hard().detach()[:, outside], other().detach()[:, outside], rtol=0, atol=1e-5)
+
+
+    def test_contours_keep_their_softness(self) -> None:
+        scene = scene_of(RegionMap.from_labels(shapes(), {(GROUND, BOX): 0.5, (GROUND, DISC): 0.9}))
+        halves = RegionMap.from_labels((torch.arange(64) // 32).expand(SIZE), 1.5)
+        result = map_of(replace_background(scene, GROUND, scene_of(halves))).softness
+        first = DISC + 1
+        assert isinstance(result, PairSoftness) and result[first, first + 1] == 1.5
+        assert {value for pair, value in result.items() if max(pair) >= first > min(pair)} == {0.7}
 
 
 def grey() -> Scene:

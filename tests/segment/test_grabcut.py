@@ -85,7 +85,7 @@ def test_bad_options(options: dict[str, Any], message: str) -> None:
 
 
 def test_no_object_is_found() -> None:
-    with pytest.raises(ValueError, match="no object is found: give another box, or a point of the object"):
+    with pytest.raises(ValueError, match="no object is found: give a box around it, or a point of it"):
         segment(torch.full((3, 64, 96), 0.5), "grabcut", box=BOX, background=[(30, 30), (50, 20), (40, 40), (65, 30)])
 
 

@@ -94,7 +94,7 @@ class TestObject:
     def test_nothing_in_the_box(self, network: Path) -> None:
         image = torch.zeros(3, 40, 60)
         image[2, 4:20, 5:20] = 1.0
-        with pytest.raises(ValueError, match="no object is found: give another box, or a point of the object"):
+        with pytest.raises(ValueError, match="no object is found: give a box around it, or a point of it"):
             segment(image, "object", model=network, box=(30, 22, 40, 30))
 
     @pytest.mark.parametrize(
