@@ -30,7 +30,7 @@ def evaluate(scene: Scene, image: Any, labels: Any = None, *, with_ssimulacra2: 
     Returns:
         By name: psnr (dB), ssim, ms_ssim, within 5 pixels of the contours ef_psnr (dB) and ef_ssim, and ssimulacra2.
         A metric that is not defined is NaN: MS-SSIM below 161 pixels per side, the edge-focused metrics without
-        contours, SSIMULACRA2 without its package, which `pip install "kcgs[visual]"` brings.
+        contours, SSIMULACRA2 without its package, which `pip install ssimulacra2` brings.
 
     Raises:
         TypeError: arguments of the wrong type.

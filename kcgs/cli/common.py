@@ -93,7 +93,7 @@ def replace_undefined(report: dict[str, Any]) -> dict[str, Any]:
 def _explain_undefined(name: str) -> str:
     """Say why a metric of `evaluate` is not defined."""
     if name == "ssimulacra2" and find_spec("ssimulacra2") is None:
-        return 'not defined: it needs pip install "kcgs[visual]"'
+        return "not defined: it needs pip install ssimulacra2"
     return f"not defined{_UNDEFINED.get(name, '')}"
 
 

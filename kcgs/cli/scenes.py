@@ -47,6 +47,7 @@ def render(
     frame: Annotated[
         float | None, typer.Option(help="Of a batch: this time alone, in frames from 0; 0.5 is halfway to the next.")
     ] = None,
+    quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Render a scene at any size, or a batch of scenes as a video, at any frame rate."""
@@ -60,7 +61,8 @@ def render(
         from .video import render_batch
 
         target = target_size(loaded[0], scale, size)
-        num_frames = render_batch(loaded, output, target, frame_rate, frame)
+        with Progress("rendering frames", pulse=True, visible=not quiet):
+            num_frames = render_batch(loaded, output, target, frame_rate, frame)
         print_report({"frames": num_frames, "height": target[0], "width": target[1]}, as_json, str(output))
         return
     exclude("a scene of one image", frame_rate=frame_rate, frame=frame)

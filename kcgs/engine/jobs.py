@@ -74,7 +74,7 @@ def run_jobs(
         try:
             from ray.util.multiprocessing import Pool
         except ImportError as error:
-            raise ImportError("engine 'ray' needs the package ray: pip install 'kcgs[ray]'") from error
+            raise ImportError("engine 'ray' needs the package ray: pip install ray") from error
         return _on_cluster(Pool, function, jobs, workers, threads, gpus)
     if workers is None or workers == 1:
         return _in_this_process(function, jobs, threads)

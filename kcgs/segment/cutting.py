@@ -188,7 +188,7 @@ def _run(pixels: NDArray[np.uint8], labels: Mask, steps: int) -> Mask:
         import cv2
     except ImportError as error:
         raise ImportError(
-            "this method needs the package opencv-python-headless: pip install 'kcgs[grabcut]'"
+            "this method needs the package opencv-python-headless: pip install opencv-python-headless"
         ) from error
     labels = np.ascontiguousarray(labels)
     if len(np.unique(labels & 1)) == 2:  # else there is nothing to tell apart

@@ -35,7 +35,7 @@ def load_pretrained(class_name: str, model: Any, device: torch.device) -> Any:
     try:
         import transformers
     except ImportError as error:
-        raise ImportError("this method needs the package transformers: pip install 'kcgs[segment]'") from error
+        raise ImportError("this method needs the package transformers: pip install transformers") from error
     if isinstance(model, torch.nn.Module):
         return model.eval().to(device)
     with library_errors(f"cannot load {str(model)!r} as {class_name}"):

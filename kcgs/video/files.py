@@ -64,7 +64,7 @@ def read_video(path: str | os.PathLike[str], *, frame_rate: float | None = None)
     folder come in natural order, ``9.png`` before ``10.png``.
 
     Args:
-        path: a video file (``pip install 'kcgs[video]'``), or a folder of images as `load_image` reads them.
+        path: a video file (``pip install av``), or a folder of images as `load_image` reads them.
         frame_rate: frames per second, above 0; None: the mean rate of the file, 24 where it has none.
 
     Returns:
@@ -123,7 +123,7 @@ def write_video(path: str | os.PathLike[str], frames: Iterable[Any], frame_rate:
     everything plays; odd sizes are yuv444p, which many browsers and telephones do not play.
 
     Args:
-        path: .mp4, .mov or .mkv (``pip install 'kcgs[video]'``); without a suffix, a new or empty folder, which gets
+        path: .mp4, .mov or .mkv (``pip install av``); without a suffix, a new or empty folder, which gets
             ``00000.png``, ``00001.png`` and so on.
         frames: images :math:`(3, H, W)` of one size, or a tensor :math:`(T, 3, H, W)`; values are clipped to [0, 1].
         frame_rate: frames per second, above 0; a folder does not store it.
@@ -161,7 +161,7 @@ def _import_av() -> Any:
     try:
         import av
     except ImportError as error:
-        raise ImportError("video files need PyAV: pip install 'kcgs[video]'") from error
+        raise ImportError("video files need PyAV: pip install av") from error
     return av
 
 

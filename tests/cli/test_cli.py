@@ -169,7 +169,7 @@ def test_metrics_that_are_not_defined_say_why(kcgs: Kcgs, monkeypatch: pytest.Mo
     assert kcgs(*FIT, "--regions", "none").code == 0
     out = kcgs("eval", "scene.safetensors", "photo.png").out
     assert "not defined: a side is below 161 pixels" in out and "not defined: no contours" in out
-    assert 'not defined: it needs pip install "kcgs[visual]"' in out
+    assert "not defined: it needs pip install ssimulacra2" in out
 
 
 class TestFailures:

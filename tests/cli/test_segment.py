@@ -49,7 +49,7 @@ class TestSegment:
         assert "the wall" in out and "a [red] door" in out and "0.75" in out and "nan" not in out
 
     def test_a_box_and_clicks(self, kcgs: Kcgs) -> None:
-        pytest.importorskip("cv2", reason="needs the extra: pip install 'kcgs[grabcut]'")
+        pytest.importorskip("cv2", reason="needs the extra: pip install opencv-python-headless")
         arguments = ("--method", "grabcut", "--box", "15,6,50,34", "--foreground", "30,20", "--background", "5,5")
         run = kcgs(*SEGMENT, *arguments)
         assert run.code == 0 and " pixels, object" in run.out and " pixels, background" in run.out

@@ -96,7 +96,7 @@ class TestRender:
         assert (load_image("out/00001.png") - expected).abs().max() < 0.6 / 255
 
     def test_video(self, kcgs: Kcgs, batch: Scene) -> None:
-        pytest.importorskip("av", reason="video files need PyAV: pip install 'kcgs[video]'")
+        pytest.importorskip("av", reason="video files need PyAV: pip install av")
         assert kcgs("render", "clip.safetensors", "-o", "out.mp4").code == 0
         video = read_video("out.mp4")
         assert video.frame_rate == 12 and video.size == (32, 48)

@@ -83,5 +83,5 @@ class TestArguments:
 
     def test_without_ray(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(sys.modules, "ray.util.multiprocessing", None)  # which other tests may have imported
-        with pytest.raises(ImportError, match=r"pip install 'kcgs\[ray\]'"):
+        with pytest.raises(ImportError, match=r"pip install ray"):
             run_jobs(str, [], engine="ray")

@@ -18,7 +18,7 @@ from kcgs.cli import main
 from kcgs.data import save_image
 from kcgs.engine import run_jobs
 
-ray = pytest.importorskip("ray", reason="needs the package ray: pip install 'kcgs[ray]'")
+ray = pytest.importorskip("ray", reason="needs the package ray: pip install ray")
 
 
 @pytest.fixture(scope="session")

@@ -439,7 +439,6 @@ class TestReplaceBackground:
         outside = map_of(scene).labels != DISC
         torch.testing.assert_close(hard().detach()[:, outside], other().detach()[:, outside], rtol=0, atol=1e-5)
 
-
     def test_contours_keep_their_softness(self) -> None:
         scene = scene_of(RegionMap.from_labels(shapes(), {(GROUND, BOX): 0.5, (GROUND, DISC): 0.9}))
         halves = RegionMap.from_labels((torch.arange(64) // 32).expand(SIZE), 1.5)

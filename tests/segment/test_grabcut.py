@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kcgs.segment import segment, segment_with_scores
 
-pytest.importorskip("cv2", reason="needs the extra: pip install 'kcgs[grabcut]'")
+pytest.importorskip("cv2", reason="needs the extra: pip install opencv-python-headless")
 
 BOX = (20, 12, 74, 52)
 
@@ -91,7 +91,7 @@ def test_no_object_is_found() -> None:
 
 def test_without_opencv(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cv2", None)
-    with pytest.raises(ImportError, match=r"pip install 'kcgs\[grabcut\]'"):
+    with pytest.raises(ImportError, match=r"pip install opencv-python-headless"):
         cut(scene()[0])
 
 

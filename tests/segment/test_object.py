@@ -77,7 +77,7 @@ class TestObject:
         assert seen == [(3, 26, 26)] and mask.sum() == 100 and mask[20:30, 40:50].all()
 
     def test_clicks_correct_the_network(self, network: Path) -> None:
-        pytest.importorskip("cv2", reason="needs the extra: pip install 'kcgs[grabcut]'")
+        pytest.importorskip("cv2", reason="needs the extra: pip install opencv-python-headless")
         image = torch.rand(3, 90, 120, generator=torch.Generator().manual_seed(0)) * 0.1
         image[2] = 0.0
         image[2, 20:50, 20:50] = 0.9  # of the object, as the network says

@@ -15,7 +15,7 @@ from kcgs.segment.methods.dino import patch_features
 from kcgs.segment.methods.sam import suppress_duplicates
 from tests.segment.checks import assert_segmentation, split_image
 
-transformers = pytest.importorskip("transformers", reason="needs the extra: pip install 'kcgs[segment]'")
+transformers = pytest.importorskip("transformers", reason="needs the extra: pip install transformers")
 
 IMAGE = split_image(40, 60, 25)
 VIT: dict[str, Any] = {"hidden_size": 24, "num_hidden_layers": 1, "num_attention_heads": 2, "image_size": 56}
