@@ -1,4 +1,4 @@
-"""Gaussians for the hole that an edit leaves, fitted to a smooth continuation of the image."""
+"""Gaussians for the hole that an edit leaves, fitted to copies of other places."""
 
 from __future__ import annotations
 

@@ -3,21 +3,30 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from itertools import product
 
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, one_hot, pad, unfold
 
+from .masks import dilate
 from .montage import choose_layers
 
-# pixels of a hole in which places are chosen: larger holes are reduced
+Window = tuple[slice, slice]
+
+# reduced pixels of a hole, and of the hole and its surroundings, at most: larger ones are reduced
 _MAX_PIXELS = 2_000
+_MAX_SURROUNDINGS = 40_000
+# extents of a hole from which places are copied, on each side of it
+_SURROUNDINGS = 2
+# pixels between two parts of a hole that are filled together
+_GAP = 16
 # half the side of the patches by which an image repeats itself, in reduced pixels
 _HALF_PATCH = 3
 # patches that are compared with all others, and of them at a time
 _PATCHES = 1_500
-_CHUNK = 250
+_CHUNK = 100
 # offsets by which patches repeat that are tried
 _REPETITIONS = 60
 # of a hole and what is around it: offsets of a smaller share of its longer side do not count as repetitions
@@ -45,38 +54,73 @@ def inpaint(image: Tensor, unknown: Tensor) -> Tensor:
 def inpaint_from_matches(image: Tensor, unknown: Tensor) -> Tensor:
     """Copy other places of the image into unknown pixels, so that seams are seen least.
 
-    The places lie at offsets by which the image repeats itself around the hole, or beside the hole. Copies are shifted
-    by a smooth continuation of the difference around them. Where no copy fits, pixels continue their surroundings
-    smoothly, as `inpaint` does.
+    The places lie at offsets by which the image repeats itself around a hole, or beside the hole. Copies are shifted by
+    a smooth continuation of the difference around them. Where no copy fits, pixels continue their surroundings
+    smoothly, as `inpaint` does. Parts of the hole that are apart are filled one by one.
 
     Source: He and Sun, "Statistics of patch offsets for image completion", 2012.
     """
-    height, width = unknown.shape
     smooth = inpaint(image, unknown)
-    reduction = max(1, round(math.sqrt(float(unknown.sum()) / _MAX_PIXELS)))
-    small = avg_pool2d(smooth, reduction, ceil_mode=True)
-    hole = max_pool2d(unknown[None].to(image), reduction, ceil_mode=True)[0] > 0
-    offsets = _offsets(small, hole)
-    layers = torch.stack([small, *(_shift(small, offset) for offset in offsets)])
-    costs = _SMOOTH_WEIGHT * (layers - small).norm(dim=1)
-    costs[0] = _SMOOTH_COST
-    for cost, offset in zip(costs[1:], offsets, strict=True):
-        cost[~_has_source(hole, offset)] = _UNKNOWN_COST
-    labels = choose_layers(layers, costs, hole)
-    shares = one_hot(labels, len(layers)).movedim(-1, 0).to(image)
-    shares = avg_pool2d(shares, 2 * _BLEND + 1, 1, _BLEND, count_include_pad=False)
-    copy = torch.zeros_like(image)
-    for share, (dy, dx) in zip(shares, [(0, 0), *offsets], strict=True):
-        if share.any():
-            share = interpolate(share[None, None], scale_factor=reduction, mode="bilinear")[0, 0, :height, :width]
-            copy += share * _shift(smooth, (reduction * dy, reduction * dx))
+    copy = smooth.clone()
+    for window, part in _parts(unknown):
+        copy[:, *window] += _copies(smooth, window, unknown[window], part) - smooth[:, *window]
     difference = (image - copy).clamp(-_LARGEST_DIFFERENCE, _LARGEST_DIFFERENCE)
     return torch.where(unknown, copy + inpaint(difference, unknown), image)
 
 
-def _shift(image: Tensor, offset: tuple[int, int]) -> Tensor:
-    """Return an image (..., H, W) that shows at each pixel what is at an offset (rows, columns) from it."""
-    return image.roll((-offset[0], -offset[1]), (-2, -1))
+def _parts(unknown: Tensor) -> Iterator[tuple[Window, Tensor]]:
+    """Yield the surroundings of each part of a hole, and which of its pixels are of the part."""
+    from scipy import ndimage
+
+    labels, count = ndimage.label(dilate(unknown, _GAP // 2).cpu().numpy())
+    number = torch.from_numpy(labels).to(unknown.device)
+    for label, box in enumerate(ndimage.find_objects(labels, count), start=1):
+        y, x = (unknown[box] & (number[box] == label)).nonzero().T
+        window = (
+            _surroundings(y + box[0].start, unknown.shape[0]), _surroundings(x + box[1].start, unknown.shape[1])
+        )  # fmt: skip
+        yield window, unknown[window] & (number[window] == label)
+
+
+def _surroundings(places: Tensor, size: int) -> slice:
+    """Return the rows or columns of a hole, and those around it."""
+    low, high = int(places.min()), int(places.max()) + 1
+    margin = _SURROUNDINGS * (high - low)
+    return slice(max(0, low - margin), min(size, high + margin))
+
+
+def _copies(image: Tensor, window: Window, unknown: Tensor, part: Tensor) -> Tensor:
+    """Return a window of a smoothly continued image (C, H, W), with copies in a part of its unknown pixels."""
+    height, width = part.shape
+    area = max(float(part.sum()) / _MAX_PIXELS, part.numel() / _MAX_SURROUNDINGS)
+    reduction = max(1, round(math.sqrt(area)))
+    small = avg_pool2d(image[:, *window], reduction, ceil_mode=True)
+    hole, chosen = (max_pool2d(t[None].to(image), reduction, ceil_mode=True)[0] > 0 for t in (unknown, part))
+    offsets = _offsets(small, hole, chosen)
+    everything = slice(0, small.shape[1]), slice(0, small.shape[2])
+    layers = torch.stack([small, *(_shifted(small, everything, offset) for offset in offsets)])
+    costs = _SMOOTH_WEIGHT * (layers - small).norm(dim=1)
+    costs[0] = _SMOOTH_COST
+    for cost, offset in zip(costs[1:], offsets, strict=True):
+        cost[~_has_source(hole, offset)] = _UNKNOWN_COST
+    labels = choose_layers(layers, costs, chosen)
+    shares = one_hot(labels, len(layers)).movedim(-1, 0).to(image)
+    shares = avg_pool2d(shares, 2 * _BLEND + 1, 1, _BLEND, count_include_pad=False)
+    copy = torch.zeros_like(image[:, *window])
+    for share, (dy, dx) in zip(shares, [(0, 0), *offsets], strict=True):
+        if share.any():
+            share = interpolate(share[None, None], scale_factor=reduction, mode="bilinear")[0, 0, :height, :width]
+            copy += share * _shifted(image, window, (reduction * dy, reduction * dx))
+    return copy
+
+
+def _shifted(image: Tensor, window: Window, offset: tuple[int, int]) -> Tensor:
+    """Return what is at an offset (rows, columns) from each pixel of a window; beyond the image, its border."""
+    rows, columns = (
+        torch.arange(part.start + step, part.stop + step, device=image.device).clamp(0, size - 1)
+        for part, step, size in zip(window, offset, image.shape[1:], strict=True)
+    )
+    return image[:, rows[:, None], columns]
 
 
 def _has_source(hole: Tensor, offset: tuple[int, int]) -> Tensor:
@@ -85,18 +129,15 @@ def _has_source(hole: Tensor, offset: tuple[int, int]) -> Tensor:
     return inside[max(offset[0], 0) :, max(offset[1], 0) :][: hole.shape[0], : hole.shape[1]]
 
 
-def _offsets(image: Tensor, hole: Tensor) -> list[tuple[int, int]]:
-    """Return offsets (rows, columns) of places to copy: repetitions of the image, and the eight beside the hole."""
-    rows, columns = (int(places.max() - places.min()) + 1 for places in hole.nonzero().T)
+def _offsets(image: Tensor, hole: Tensor, part: Tensor) -> list[tuple[int, int]]:
+    """Return offsets (rows, columns) of places to copy: repetitions of the image, and the eight beside a part."""
+    rows, columns = (int(places.max() - places.min()) + 1 for places in part.nonzero().T)
     beside = {(rows * down, columns * right) for down, right in product((-1, 0, 1), repeat=2)} - {(0, 0)}
     return sorted({*_repetitions(image, hole), *beside})
 
 
 def _repetitions(image: Tensor, hole: Tensor) -> list[tuple[int, int]]:
-    """Return the offsets (rows, columns) from most patches around a hole to those that look most like them."""
-    y, x = hole.nonzero().T
-    rows, columns = _surroundings(y, hole.shape[0]), _surroundings(x, hole.shape[1])
-    image, hole = image[:, rows, columns], hole[rows, columns]
+    """Return the offsets (rows, columns) from most patches outside a hole to those that look most like them."""
     (height, width), side = hole.shape, 2 * _HALF_PATCH + 1
     if min(height, width) <= side:
         return []
@@ -120,12 +161,6 @@ def _repetitions(image: Tensor, hole: Tensor) -> list[tuple[int, int]]:
     counts = torch.where(counts == max_pool2d(counts, 5, 1, 2), counts, 0)[0].flatten()
     best = counts.topk(min(_REPETITIONS, int((counts > 0).sum()))).indices
     return [(int(i) // (2 * width + 1) - height, int(i) % (2 * width + 1) - width) for i in best]
-
-
-def _surroundings(places: Tensor, size: int) -> slice:
-    """Return the rows or columns from those of a hole less its extent to those of the hole plus its extent."""
-    low, high = int(places.min()), int(places.max()) + 1
-    return slice(max(0, 2 * low - high), min(size, 2 * high - low))
 
 
 def _pull_push(image: Tensor, weight: Tensor) -> Tensor:

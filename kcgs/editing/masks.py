@@ -20,7 +20,8 @@ _OFFSET_TOLERANCE = 1e-6
 
 def dilate(mask: Tensor, reach: int) -> Tensor:
     """Add the pixels within `reach` rows and columns of a mask (H, W)."""
-    return max_pool2d(mask[None].float(), 2 * reach + 1, 1, reach)[0] > 0
+    rows = max_pool2d(mask[None].float(), (2 * reach + 1, 1), 1, (reach, 0))
+    return max_pool2d(rows, (1, 2 * reach + 1), 1, (0, reach))[0] > 0
 
 
 def nearest_labels(labels: Tensor, hole: Tensor) -> Tensor:

@@ -55,7 +55,8 @@ def select_removable_regions(scene: Scene, region_ids: object) -> Selection:
 
 def unique_region_ids(region_ids: object, known: Tensor, owner: str) -> list[int]:
     """Return one id or several as a sorted list, each once, if all are among the `known` ids of the owner."""
-    sequence = region_ids if isinstance(region_ids, Iterable) else [region_ids]
+    has_one = getattr(region_ids, "ndim", 1) == 0  # such as labels[y, x], which has a method __iter__
+    sequence = region_ids if isinstance(region_ids, Iterable) and not has_one else [region_ids]
     ids = sorted({check_count("region_ids", region, 0) for region in sequence})
     if not ids:
         raise ValueError("region_ids must hold an id; got none")
