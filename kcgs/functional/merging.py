@@ -35,7 +35,7 @@ def merge_regions(
         objects: :math:`(H, W)` integer, a coarser map: regions of two objects do not merge; None: all may.
 
     Returns:
-        :math:`(H, W)` int64; merged regions have the id of one of them; one region where no contour saves its cost.
+        :math:`(H, W)` int64; merged regions have the id of one of them.
 
     Raises:
         TypeError, ValueError: as :func:`kcgs.functional.choose_softness`; a negative cost.
@@ -53,7 +53,10 @@ def merge_regions(
     ids, labels = torch.unique(labels, return_inverse=True)
     owners = torch.zeros_like(ids)
     if objects is not None:
-        owners[labels] = check_labels("objects", objects).to(ids)
+        objects = check_labels("objects", objects, dims=(2,)).to(ids)
+        if objects.shape != labels.shape:
+            raise ValueError(f"objects must have shape {tuple(labels.shape)}; got {tuple(objects.shape)}")
+        owners[labels] = objects
     for _ in range(_ROUNDS):
         gains = contour_gain(image, labels)
         saved = {

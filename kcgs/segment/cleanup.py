@@ -152,7 +152,7 @@ def merge_small(labels: Labels, min_size: int, objects: Labels | None = None) ->
 
     The smallest piece is merged first, and a piece that reaches ``min_size`` by merging stays. Of neighbours with equal
     borders the larger takes it, then the one whose first pixel comes earlier. Pieces that stay keep their label. Pieces
-    of different objects, of which no label crosses a contour, do not merge.
+    of different objects do not merge; labels must not cross their contours.
     """
     pieces = connect(labels)
     graph = RegionGraph(pieces, objects)

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs._warn import warn_user
+from kcgs.errors import InvalidArgument
 from kcgs.segment.cleanup import Prediction, merge_small
 from kcgs.segment.images import reduce_image, rgb_to_lab, to_pixels
-from kcgs.segment.prompts import Box, Point, Prompt
+from kcgs.segment.prompts import Box, Point, Prompt, window_of
 from kcgs.segment.snapping import snap_contours
 
 # Tuned by the overlap with masks of DAVIS, from boxes and from masks of ISNet: `python -m benchmarks.objects`.
@@ -28,15 +29,15 @@ _CLICK_STEPS = 3
 _LEAST_DEPTH = 0.03
 _MOST_DEPTH = 0.15
 # radius around a click of what surely has its label, in depths
-_SURE = 0.5
+_SURE_RADIUS = 0.5
 # radius of what has its label to begin with, in depths
-_CHANGED = 1.5
+_CHANGED_RADIUS = 1.5
 # radius of what may change, in depths
-_OPEN = 3.0
+_OPEN_RADIUS = 3.0
 # least radius of what may change, in sides of the box
-_LEAST_OPEN = 0.1
+_LEAST_OPEN_RADIUS = 0.1
 # radius of what GrabCut sees around a click, in radii of what may change
-_SEEN = 1.5
+_SEEN_RADIUS = 1.5
 # pieces and holes of a smaller share of the box and its margin vanish
 _LEAST_PIECE = 0.002
 # pixels of the reduced image around a change, where the contour at full size changes with it
@@ -50,7 +51,7 @@ NAMES = ["background", "object"]
 Mask = NDArray[np.uint8]
 
 
-def cut_from_box(image: Tensor, box: Box, prompt: Prompt) -> Prediction:
+def cut_from_box(image: Tensor, prompt: Prompt) -> Prediction:
     """Cut an object out of an image (3, H, W) in [0, 1]: what differs from the colours around a box, and its clicks.
 
     Raises:
@@ -59,36 +60,41 @@ def cut_from_box(image: Tensor, box: Box, prompt: Prompt) -> Prediction:
     Warns:
         UserWarning: a click that the mask does not follow.
     """
-    crop = _Crop(image, box)
+    assert prompt.box is not None
+    crop = _Crop(image, prompt.box)
     mask = _follow_clicks(crop, _cut_box(crop), prompt)
     labels = torch.zeros(image.shape[1:], dtype=torch.int64)
     labels[crop.window] = crop.enlarge(mask)
-    return _check_result(labels, prompt)
+    return _check_object(labels, prompt)
 
 
 def correct_mask(image: Tensor, mask: Tensor, prompt: Prompt) -> Prediction:
     """Correct the mask of an object, (H, W) bool, by clicks; errors and warnings are those of `cut_from_box`."""
+    from scipy.ndimage import binary_dilation
+
     labels = mask.long()
     if prompt.clicks:
         crop = _Crop(image, prompt.box or _bounds(mask, prompt))
         before = crop.reduce(mask)
         after = _follow_clicks(crop, before, prompt)
-        reach = math.ceil(_FRINGE / min(crop.scale))
-        changed = F.interpolate(torch.from_numpy(before != after)[None, None].float(), crop.image.shape[1:])
-        is_near = F.max_pool2d(changed, 2 * reach + 1, 1, reach)[0, 0] > 0
+        changed = torch.from_numpy(binary_dilation(before != after, iterations=_FRINGE))[None, None].float()
+        is_near = F.interpolate(changed, crop.image.shape[1:])[0, 0] > 0
         labels[crop.window] = torch.where(is_near, crop.enlarge(after), labels[crop.window])
-    return _check_result(labels, prompt)
+    return _check_object(labels, prompt)
 
 
 def _bounds(mask: Tensor, prompt: Prompt) -> Box:
-    """Return the box of a mask and of the clicks."""
+    """Return the box of a mask and of the clicks; without a mask, that of the image."""
+    if not mask.any():
+        return 0.0, 0.0, float(mask.shape[1]), float(mask.shape[0])
     y, x = (places.tolist() for places in mask.nonzero().T)
     x += [click_x for (click_x, _), _ in prompt.clicks]
     y += [click_y for (_, click_y), _ in prompt.clicks]
     return min(x), min(y), max(x) + 1.0, max(y) + 1.0
 
 
-def _check_result(labels: Tensor, prompt: Prompt) -> Prediction:
+def _check_object(labels: Tensor, prompt: Prompt) -> Prediction:
+    """Return labels 0 and 1 of the background and an object, which must have a pixel; warn of clicks beside it."""
     if not labels.any():
         raise ValueError("no object is found: give a box around it, or a point of it as foreground")
     for (x, y), label in prompt.clicks:
@@ -102,7 +108,8 @@ class _Crop:
 
     def __init__(self, image: Tensor, box: Box) -> None:
         height, width = image.shape[1:]
-        self.window = _window(box[1], box[3], height), _window(box[0], box[2], width)
+        left, top, right, bottom = box
+        self.window = window_of((left - 1, top - 1, right + 1, bottom + 1), _MARGIN, height, width)
         self.image = image.cpu()[:, *self.window]
         small = reduce_image(self.image.permute(1, 2, 0).contiguous().permute(2, 0, 1), _MAX_PIXELS)
         self.pixels: NDArray[np.uint8] = np.round(to_pixels(small) * 255).astype(np.uint8)
@@ -131,17 +138,13 @@ class _Crop:
         return torch.from_numpy(large)
 
 
-def _window(low: float, high: float, size: int) -> slice:
-    """Return the pixels of one axis that matter: those of the box, with a margin."""
-    margin = _MARGIN * (high - low) + 1
-    return slice(max(0, math.floor(low - margin)), min(size, math.ceil(high + margin)))
-
-
 def _cut_box(crop: _Crop) -> Mask:
     """Return where the object of the box is, (h, w) of 0 and 1: what has other colours than what is around the box."""
     left, top, right, bottom = crop.box
     labels = np.full(crop.pixels.shape[:2], _BACKGROUND, dtype=np.uint8)
     labels[math.floor(top) : math.ceil(bottom), math.floor(left) : math.ceil(right)] = _PERHAPS_OBJECT
+    if labels.all():
+        raise InvalidArgument("box", "pixels of the background around it", "a box of the whole image", verb="have")
     return _run(crop.pixels, labels, _BOX_STEPS)
 
 
@@ -152,7 +155,7 @@ def _follow_clicks(crop: _Crop, mask: Mask, prompt: Prompt) -> Mask:
     clicks = [((x, y), label) for (x, y), label in clicks if label or (left <= x < right and top <= y < bottom)]
     sure = np.full(mask.shape, _PERHAPS_OBJECT, dtype=np.uint8)
     for point, label in clicks:
-        sure[_distances(mask, point) <= _SURE * _depth(mask, point, label, crop.side)] = label
+        sure[_distances(mask, point) <= _SURE_RADIUS * _depth(mask, point, label, crop.side)] = label
     for point, label in clicks:
         mask = np.where(_change(crop, mask, sure, point, label), label, mask).astype(np.uint8)
     return mask
@@ -163,21 +166,19 @@ def _change(crop: _Crop, mask: Mask, sure: Mask, point: Point, label: int) -> ND
     from scipy import ndimage
 
     depth = _depth(mask, point, label, crop.side)
-    distances, radius = _distances(mask, point), max(_OPEN * depth, _LEAST_OPEN * crop.side)
+    distances, radius = _distances(mask, point), max(_OPEN_RADIUS * depth, _LEAST_OPEN_RADIUS * crop.side)
     labels = mask + _PERHAPS_BACKGROUND
-    labels[distances < _CHANGED * depth] = label + _PERHAPS_BACKGROUND
+    labels[distances < _CHANGED_RADIUS * depth] = label + _PERHAPS_BACKGROUND
     labels = np.where(distances > radius, mask, labels)
     labels = np.where(sure <= _OBJECT, sure, labels)
-    window = (
-        *(
-            slice(max(0, math.floor(center - _SEEN * radius)), math.ceil(center + _SEEN * radius))
-            for center in (point[1], point[0])
-        ),
+    window = tuple(
+        slice(max(0, math.floor(center - _SEEN_RADIUS * radius)), math.ceil(center + _SEEN_RADIUS * radius))
+        for center in (point[1], point[0])
     )
     result = mask.copy()
     result[window] = _run(crop.pixels[window], labels[window], _CLICK_STEPS)
     is_changed: NDArray[np.bool_] = (result == label) & (mask != label)
-    pieces = np.asarray(ndimage.label(is_changed | (distances <= _SURE * depth))[0])
+    pieces = np.asarray(ndimage.label(is_changed | (distances <= _SURE_RADIUS * depth))[0])
     is_changed &= pieces == pieces[math.floor(point[1]), math.floor(point[0])]
     return is_changed
 

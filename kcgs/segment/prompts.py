@@ -1,9 +1,9 @@
 """A box and clicks that ask for one object."""
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import torch
 from torch import Tensor
 
 from kcgs._check import check_number, check_numbers
@@ -67,5 +67,17 @@ def _check_points(name: str, values: Points | None, width: int, height: int) -> 
     ]
 
 
-def _to_list(values: Points) -> Any:
-    return torch.as_tensor(values).tolist() if hasattr(values, "tolist") else values
+def window_of(box: Box, margin: float, height: int, width: int) -> tuple[slice, slice]:
+    """Return the rows and columns of a box that is larger by a share of its sides, on each side."""
+    rows, columns = (
+        slice(max(0, math.floor(low - margin * (high - low))), min(size, math.ceil(high + margin * (high - low))))
+        for low, high, size in ((box[1], box[3], height), (box[0], box[2], width))
+    )
+    return rows, columns
+
+
+def _to_list(values: Any) -> Any:
+    """Return tensors and arrays, and lists of them, as lists."""
+    if hasattr(values, "tolist"):
+        return values.tolist()
+    return [_to_list(value) for value in values] if isinstance(values, list | tuple) else values

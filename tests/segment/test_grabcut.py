@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -41,6 +42,11 @@ def test_a_box_has_all_that_is_not_background() -> None:
     image, red, blue = scene()
     assert overlap(cut(image), red | blue) > 0.97
     assert torch.equal(segment(image, "grabcut", box=torch.tensor(BOX)), segment(image, "grabcut", box=BOX))
+    points = np.argwhere(red.numpy())[::200, ::-1]  # (x, y), with a negative stride
+    masks = (
+        segment(image, "grabcut", box=BOX, foreground=clicks) for clicks in (points, list(points), points.tolist())
+    )
+    assert len({mask.numpy().tobytes() for mask in masks}) == 1
 
 
 @pytest.mark.parametrize("clicks", [{"background": [[66, 32]]}, {"background": torch.tensor([[66.0, 32.0]])}])
@@ -73,6 +79,7 @@ def test_small_images(size: tuple[int, int]) -> None:
         ({}, "box must be given for the method 'grabcut'; got none"),
         ({"box": (0, 0, 96, 64)}, "box must have pixels of the background around it; got a box of the whole image"),
         ({"box": (50, 0, 40, 9)}, r"box must hold left, top, right, bottom with pixels of the 96 x 64 image; got \(50"),
+        ({"box": (0, 0, 95.5, 63.5)}, "box must have pixels of the background around it"),
         ({"box": (1, 2, 3)}, "box must be 4 numbers"),
         ({"box": BOX, "foreground": [[3, 4]]}, r"foreground must be in the box; got \(3.0, 4.0\)"),
         ({"box": BOX, "foreground": [3, 4]}, r"foreground must be a list of points \(x, y\); got \[3, 4\]"),

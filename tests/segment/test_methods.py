@@ -185,6 +185,11 @@ class TestAuto:
         assert torch.equal(labels == 1, (image[2] > 0) & (image[0] == 0))
 
     def test_bad_objects(self) -> None:
+        halves = (torch.arange(80) > 40).expand(60, 80)
+        with pytest.raises(ValueError, match="max_regions must be at least 2, the number of pieces of objects; got 1"):
+            segment(torch.rand(3, 60, 80), objects=halves, max_regions=1)
+        with pytest.raises(ValueError, match="snap must be 0 with objects"):
+            segment(torch.rand(3, 60, 80), objects=halves, snap=2)
         with pytest.raises(ValueError, match=r"objects must be of the image's size \(60, 80\); got \(6, 8\)"):
             segment(torch.rand(3, 60, 80), objects=torch.zeros(6, 8, dtype=torch.int64))
         with pytest.raises(TypeError, match="objects must be"):

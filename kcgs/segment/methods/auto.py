@@ -13,7 +13,7 @@ from kcgs.compiled import image_threads_for_kernels
 from kcgs.errors import InvalidArgument
 from kcgs.functional import merge_regions
 from kcgs.maps import Labels, compact
-from kcgs.segment.cleanup import Cleanup, Prediction, clean, merge_similar, merge_small, to_regions
+from kcgs.segment.cleanup import Cleanup, Prediction, clean, connect, merge_similar, merge_small, to_regions
 from kcgs.segment.images import lab_sums, reduce_image, rgb_to_lab
 from kcgs.segment.registry import register, segment_with_scores
 from kcgs.segment.snapping import snap_contours
@@ -37,7 +37,7 @@ _LARGE = 2 * 1920 * 1080
 
 @register("auto", Cleanup(max_regions=30))
 @image_threads_for_kernels
-def auto(image: Tensor, *, objects: Any = None, min_size: int, max_regions: int | None) -> Prediction:
+def auto(image: Tensor, *, objects: Any = None, snap: int, min_size: int, max_regions: int | None) -> Prediction:
     """Segment a photo into up to 30 clean connected regions, fewer where contours would save too little.
 
     The method of Felzenszwalb and Huttenlocher, with its scale halved up to twice while fewer than 4 regions result
@@ -58,11 +58,13 @@ def auto(image: Tensor, *, objects: Any = None, min_size: int, max_regions: int 
         objects: a label map of the image's size, as :func:`kcgs.fit` takes it, whose ids are the names; or "object":
             the main object, which the method of this name finds; None: areas of similar colour only. Pieces under
             ``min_size`` are part of what is around them.
+        snap: of the clean-up; 0 with objects.
         min_size: of the clean-up, in pixels.
         max_regions: of the clean-up.
 
     Raises:
-        TypeError, ValueError: ``objects`` is no label map of the image's size; errors of the method "object".
+        TypeError, ValueError: ``objects`` is no label map of the image's size, or in more pieces than ``max_regions``;
+            errors of the method "object".
 
     Example:
         >>> from kcgs.segment import segment
@@ -75,7 +77,12 @@ def auto(image: Tensor, *, objects: Any = None, min_size: int, max_regions: int 
     image = image.cpu()
     if objects is None:
         return Prediction(_divide(image, None, min_size, max_regions))
+    if snap:
+        raise InvalidArgument("snap", "0 with objects, whose contours stay", snap)
     owners, names = _find_objects(image, objects, min_size)
+    pieces = int(connect(owners).max()) + 1
+    if max_regions is not None and pieces > max_regions:
+        raise InvalidArgument("max_regions", f"at least {pieces}, the number of pieces of objects", max_regions)
     regions = _divide(image, owners, min_size, max_regions)
     owner_of_region = np.zeros(int(regions.max()) + 1, np.int64)
     owner_of_region[regions] = owners

@@ -2,7 +2,6 @@
 
 from torch import Tensor
 
-from kcgs.errors import InvalidArgument
 from kcgs.segment.cleanup import Cleanup, Prediction
 from kcgs.segment.cutting import cut_from_box
 from kcgs.segment.prompts import Points, check_prompt
@@ -37,9 +36,4 @@ def grabcut(
     Example:
         ``segment(image, "grabcut", box=(30, 40, 200, 180), background=[(60, 70)])``
     """
-    prompt = check_prompt(image, box, foreground, background)
-    assert prompt.box is not None
-    height, width = image.shape[1:]
-    if prompt.box == (0, 0, width, height):
-        raise InvalidArgument("box", "pixels of the background around it", "a box of the whole image", verb="have")
-    return cut_from_box(image, prompt.box, prompt)
+    return cut_from_box(image, check_prompt(image, box, foreground, background))

@@ -1,7 +1,6 @@
 """The main object of a photo, by a network that needs no prompt."""
 
 import hashlib
-import math
 import os
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +15,7 @@ from kcgs.segment.cleanup import Cleanup, Prediction, merge_small
 from kcgs.segment.cutting import NAMES, correct_mask
 from kcgs.segment.methods.onnx import saliency
 from kcgs.segment.networks import IMAGENET_MEAN, IMAGENET_STD
-from kcgs.segment.prompts import Box, Points, check_prompt
+from kcgs.segment.prompts import Points, check_prompt, window_of
 from kcgs.segment.registry import register
 
 _RELEASE = "https://github.com/danielgatis/rembg/releases/download/v0.0.0"
@@ -46,7 +45,7 @@ _WEIGHTS = {
 _DEFAULT = "isnet-general-use"
 # what the network sees around a box, in sides of the box: with less it takes parts for the whole
 _VIEW = 0.8
-# of the image: smaller specks and holes of the network's mask vanish; those of a twentieth of a percent are spokes
+# of what the network sees: smaller specks and holes of its mask vanish; those that are larger are parts, such as spokes
 _LEAST_PIECE = 2e-4
 
 
@@ -71,7 +70,8 @@ def find_object(
 
     Args:
         image: as `segment` takes it, any size.
-        model: isnet-general-use, birefnet-general, u2netp, or an ONNX file of ISNet; :func:`onnx` takes other networks.
+        model: isnet-general-use, birefnet-general, u2netp, or an ONNX file: by its name one of theirs, else ISNet's;
+            the method "onnx" takes other networks.
         threshold: of the object's score, in [0, 1].
         pieces: every connected piece of the object is a region of its own; False: all are one.
         box: left, top, right, bottom in pixels, around the object that is meant; None: the whole image.
@@ -94,29 +94,20 @@ def find_object(
     path, weights = _find_weights(model)
     height, width = image.shape[1:]
     box = prompt.box or (0.0, 0.0, float(width), float(height))
-    view, inside = _window(box, _VIEW, image), _window(box, 0.0, image)
+    view, inside = window_of(box, _VIEW, height, width), window_of(box, 0.0, height, width)
     seen = saliency(image[:, *view], path, threshold, weights.mean, weights.std)
     labels, scores = torch.zeros(height, width, dtype=torch.int64), torch.full((height, width), torch.nan)
     labels[view], scores[view] = seen.labels, seen.scores
     mask = torch.zeros_like(labels)
     mask[inside] = labels[inside]
-    mask = torch.from_numpy(merge_small(mask.numpy(), max(1, round(_LEAST_PIECE * mask.numel()))))
+    mask = torch.from_numpy(merge_small(mask.numpy(), max(1, round(_LEAST_PIECE * labels[view].numel()))))
     prediction = correct_mask(image, mask > 0, prompt)
     scores[prediction.labels != labels] = torch.nan  # these are the network's, of the other label
     prediction = prediction._replace(scores=scores)
-    return _divide(prediction) if pieces else prediction
+    return _label_pieces(prediction) if pieces else prediction
 
 
-def _window(box: Box, margin: float, image: Tensor) -> tuple[slice, slice]:
-    """Return the rows and columns of a box that is larger by a share of its sides, on each side."""
-    rows, columns = (
-        slice(max(0, math.floor(low - margin * (high - low))), min(size, math.ceil(high + margin * (high - low))))
-        for low, high, size in ((box[1], box[3], image.shape[1]), (box[0], box[2], image.shape[2]))
-    )
-    return rows, columns
-
-
-def _divide(prediction: Prediction) -> Prediction:
+def _label_pieces(prediction: Prediction) -> Prediction:
     """Make every connected piece of the object a label of its own."""
     from scipy import ndimage
 
@@ -129,7 +120,8 @@ def _find_weights(model: str | os.PathLike[str]) -> tuple[Path, _Weights]:
     if (weights := _WEIGHTS.get(str(model))) is None:
         if Path(model).suffix != ".onnx":
             raise InvalidArgument("model", f"one of {', '.join(_WEIGHTS)}, or an ONNX file", repr(str(model)))
-        return Path(model), _WEIGHTS[_DEFAULT]
+        known = {weights.file: weights for weights in _WEIGHTS.values()}
+        return Path(model), known.get(Path(model).name, _WEIGHTS[_DEFAULT])
     folder = Path(os.environ.get(_FOLDER_VARIABLE, _FOLDER)).expanduser()
     path, url = folder / weights.file, f"{_RELEASE}/{weights.file}"
     if not path.is_file():
@@ -147,5 +139,5 @@ def _download(url: str, path: Path, md5: str) -> None:
                 raise OSError("the file has another checksum")
     except OSError as error:  # of the network, too
         reason = " ".join(str(error).split())
-        hint = f"download {url} to {path}, or pass model=FILE.onnx"
+        hint = f"download {url} to {path}, or pass model=FOLDER/{path.name}"
         raise ValueError(f"cannot load the weights of {path.stem}: {reason}; {hint}") from error
