@@ -104,15 +104,16 @@ def fit_batch(loaded: Sequence[Loaded], request: FitRequest) -> list[BatchFit]:
         result = fit(images, labels, request.num_gaussians, recipe=request.load_config(), seed=request.seed)
     seconds = result.seconds / len(loaded)
     parts = [result.of_image(k) for k in range(len(loaded))]
-    return [BatchFit(part, seconds, _warnings_of(part, request)) for part in parts]
+    count = request.count_for(*images.shape[-2:])
+    return [BatchFit(part, seconds, _warnings_of(part, count)) for part in parts]
 
 
-def _warnings_of(result: FitResult, request: FitRequest) -> tuple[str, ...]:
+def _warnings_of(result: FitResult, count: int) -> tuple[str, ...]:
     """Say of one image of a batch what its fit alone would have warned of."""
     from kcgs.fitting import describe_excess
 
     messages = ["the fit diverged: the best so far is kept"] if result.diverged else []
-    report, count = result.regions, request.num_gaussians
+    report = result.regions
     if report is not None and not isinstance(report, list) and report.num_before > count and result.config.guidance:
         messages.append(describe_excess(report.num_before - count, report.num_before, count, result.config))
     return tuple(messages)

@@ -122,7 +122,8 @@ def _fit_and_save(part: ShardPart, loaded: dict[int, Loaded], errors: dict[int, 
     except Exception as error:  # of all of them: their images and maps were read
         return {index: Outcome({"error": describe_error(error)}, True) for index in loaded}
     with_maps = part.images[0].regions != "none"
-    scenes = stack_scenes([fit.result.scene for fit in fits], request.num_gaussians, with_maps=with_maps)
+    singles = [fit.result.scene for fit in fits]
+    scenes = stack_scenes(singles, request.count_for(*singles[0].size), with_maps=with_maps)
     field = reorder_rows(scenes.field, rank_gaussians(scenes.field, scenes.regions))
     scenes = Scene(field, scenes.regions).to("cpu")
     names = [part.images[index].image.name for index in loaded]

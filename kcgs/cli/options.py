@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from kcgs.fitting import FitConfig
     from kcgs.scene import Scene
 
-DEFAULT_GAUSSIANS = 1000
-
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")]
 ResizeRegions = Annotated[
     bool, typer.Option("--resize-regions", help="Resize a label map of another size to that of the image.")
@@ -41,7 +39,8 @@ Objective = Annotated[
 class FitRequest(NamedTuple):
     """The options of a fit besides the image and its regions."""
 
-    num_gaussians: int
+    num_gaussians: int | None
+    """None: by the size of the image."""
     target_bytes: int | None
     """Of a `.kcgs` file; the number of Gaussians then follows from it."""
     recipe: str
@@ -55,6 +54,12 @@ class FitRequest(NamedTuple):
     def default_suffix(self) -> str:
         """Suffix of the file, where none is given."""
         return ".safetensors" if self.target_bytes is None else ".kcgs"
+
+    def count_for(self, height: int, width: int) -> int:
+        """Return the number of Gaussians of an image of a size."""
+        from kcgs.fitting import default_num_gaussians
+
+        return self.num_gaussians or default_num_gaussians(height, width)
 
     def load_config(self) -> FitConfig:
         """Return the recipe with these settings; a ValueError names a wrong one."""
@@ -77,7 +82,7 @@ class FitRequest(NamedTuple):
 def fit_request(
     num_gaussians: Annotated[
         int | None,
-        typer.Option("-n", "--num-gaussians", min=1, help=f"Number of Gaussians; default: {DEFAULT_GAUSSIANS}."),
+        typer.Option("-n", "--num-gaussians", min=1, help="Number of Gaussians; default: 100, or one per 100 pixels."),
     ] = None,
     recipe: Annotated[str, typer.Option(help="Recipe by name.")] = "best",
     iterations: Annotated[
@@ -86,7 +91,7 @@ def fit_request(
     objective: Objective = None,
     max_seconds: Annotated[float | None, typer.Option(help="Wall time of the fit.")] = None,
     target_psnr: Annotated[
-        float | None, typer.Option(help="As few Gaussians as reach this PSNR in dB, at most --num-gaussians.")
+        float | None, typer.Option(help="About as few Gaussians as reach this PSNR in dB, at most --num-gaussians.")
     ] = None,
     target_bytes: Annotated[
         int | None,
@@ -113,7 +118,7 @@ def fit_request(
     settings = {key: value for key, value in settings.items() if value is not None}
     if keep_contours:
         settings |= {"move_contours": False, "merge_regions": False}
-    return FitRequest(num_gaussians or DEFAULT_GAUSSIANS, target_bytes, recipe, settings, seed, device)
+    return FitRequest(num_gaussians, target_bytes, recipe, settings, seed, device)
 
 
 def with_fit_options(command: Callable[..., None], *, without: tuple[str, ...] = ()) -> Callable[..., None]:

@@ -13,6 +13,10 @@ from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap
 from kcgs.maps import as_region_map
 
+# of the default number of Gaussians
+_PIXELS_PER_GAUSSIAN = 100
+_LEAST_GAUSSIANS = 100
+
 
 def check_image_and_regions(image: Any, regions: object) -> tuple[Tensor, RegionMap | None]:
     """Return a copy of the image, (C, H, W), that may take part in a graph, and its regions, on its device."""
@@ -60,10 +64,18 @@ def regions_of(size: tuple[int, ...], regions: object, num_images: int | None = 
     return regions
 
 
-def check_num_gaussians(value: object, image: Tensor) -> int:
-    """Return N if it is a number of Gaussians that an image (..., C, H, W) can use."""
-    count, (height, width) = check_count("num_gaussians", value), image.shape[-2:]
+def default_num_gaussians(height: int, width: int) -> int:
+    """Return N for an image of a size: one Gaussian per 100 pixels, 100 at least, but no more than pixels."""
     pixels = height * width
+    return min(pixels, max(_LEAST_GAUSSIANS, pixels // _PIXELS_PER_GAUSSIAN))
+
+
+def check_num_gaussians(value: object, image: Tensor) -> int:
+    """Return N if it is a number of Gaussians that an image (..., C, H, W) can use; for None the default."""
+    height, width = image.shape[-2:]
+    if value is None:
+        return default_num_gaussians(height, width)
+    count, pixels = check_count("num_gaussians", value), height * width
     if count > pixels:
         size = f"{width} x {height}"
         raise InvalidArgument("num_gaussians", f"at most {pixels}, the pixels of the {size} image", count)

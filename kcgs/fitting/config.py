@@ -107,7 +107,7 @@ class FitConfig(BaseModel):
         description="seconds that a fit may take, about; its schedule then follows the time, not the iterations",
     )
     target_psnr: float | None = Field(
-        None, gt=0.0, description="the fewest Gaussians that reach this PSNR (dB), by a search over several fits"
+        None, gt=0.0, description="about the fewest Gaussians that reach this PSNR (dB), by a search over several fits"
     )
 
     def __init__(self, **values: Any) -> None:

@@ -40,7 +40,7 @@ from .user_objects import Densifier, split_names
 def fit(
     image: Any,
     regions: Any = None,
-    num_gaussians: int = 1000,
+    num_gaussians: int | None = None,
     *,
     recipe: str | FitConfig = "best",
     objective: str | Loss | None = None,
@@ -61,7 +61,7 @@ def fit(
     clock stops it). On a GPU the history comes up to 20 iterations late. The best state that was logged is returned,
     not the last. The first 85 % of a fit render drafts with a larger cutoff, and are not compared with the rest. The
     scene holds fewer than N Gaussians where the recipe prunes, or its target takes fewer. With `target_psnr` several
-    fits search for the fewest Gaussians that reach it; `on_step` counts the iterations of each.
+    fits search for about the fewest Gaussians that reach it; `on_step` counts the iterations of each.
 
     All images of a batch have the same number of rows; one that an image has no use for has the colour 0. On a CPU an
     image gets the scene that it gets alone with the same seed, bit for bit, unless the clock stops the fit, there are
@@ -79,9 +79,10 @@ def fit(
         regions: label map of the image's size: a Tensor or a numpy array, integer or bool, a PIL image, or a path, as
             :func:`kcgs.data.load_labels` reads it; or a RegionMap. EF-PSNR is measured along its contours. None: one
             region. For a batch one for all images, or one for each.
-        num_gaussians: N, the most there may be for each image, from 1 to the number of pixels. Where it is below the
-            number of regions, those most alike are merged until each has a Gaussian, or with ``merge_regions=False``
-            the smaller ones stay empty and black; a UserWarning gives their number.
+        num_gaussians: N, the most there may be for each image, from 1 to the number of pixels; None: one per 100
+            pixels, at least 100. Where it is below the number of regions, those most alike are merged until each has a
+            Gaussian, or with ``merge_regions=False`` the smaller ones stay empty and black; a UserWarning gives their
+            number.
         recipe: a name from :func:`available_recipes`, or settings.
         objective: what is lowered, by a name of :class:`FitConfig`; or a loss of your own, a function from a render,
             :math:`(1, C, H, W)`, not clipped, to a scalar, through which autograd goes. None: the recipe's, else l2.

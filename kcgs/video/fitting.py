@@ -18,7 +18,7 @@ from kcgs._objectives import objective_for
 from kcgs._progress import Progress
 from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
-from kcgs.fitting import FitConfig, check_image_and_regions, fit
+from kcgs.fitting import FitConfig, check_image_and_regions, default_num_gaussians, fit
 from kcgs.functional import RegionMap, lookup_regions
 from kcgs.nn import pad_rows
 from kcgs.optim import Gaussians
@@ -52,7 +52,7 @@ _MOVABLE_SHARE = 0.1
 def fit_video(
     frames: Iterable[Any],
     label_maps: Labels | Iterable[Labels] | None = None,
-    num_gaussians: int = 1000,
+    num_gaussians: int | None = None,
     *,
     recipe: str | FitConfig = "best",
     seed: int = 0,
@@ -74,7 +74,7 @@ def fit_video(
             memory at a time.
         label_maps: one for each frame; or that of the first frame, :math:`(H, W)`, which moves with the image up to a
             scene cut, and is one region from there. None: one region.
-        num_gaussians: N, of every frame.
+        num_gaussians: N, of every frame; None: one per 100 pixels, at least 100.
         recipe: of the first frame, and of the first after a scene cut.
         seed: of the random start.
         on_frame: called with the number of every frame, from 0, and its scene; returning True ends the fit.
@@ -100,7 +100,7 @@ def fit_video(
     """
     config = FitConfig.from_recipe(recipe, **({"merge_regions": False} | settings))
     config = config.model_copy(update={"objective": objective_for("video", config.objective)})
-    video = _VideoFit(config, check_count("num_gaussians", num_gaussians), seed)
+    video = _VideoFit(config, None if num_gaussians is None else check_count("num_gaussians", num_gaussians), seed)
     length = len(frames) if isinstance(frames, Sized) else None
     with Progress("fit-video", pulse=length is None, visible=progress) as bar:
         for number, (frame, labels) in enumerate(_pair(frames, label_maps if config.guidance else None)):
@@ -117,7 +117,7 @@ def fit_video(
 class _VideoFit:
     """A fit of one frame after the other."""
 
-    def __init__(self, config: FitConfig, num_gaussians: int, seed: int) -> None:
+    def __init__(self, config: FitConfig, num_gaussians: int | None, seed: int) -> None:
         self.config, self.num_gaussians, self.seed = config, num_gaussians, seed
         self.frames: list[Scene] = []
         self.image = torch.zeros(())  # the last frame, (C, H, W); a placeholder before the first
@@ -149,6 +149,7 @@ class _VideoFit:
         config = self.config
         if self.frames:  # contours have the softness of the first frame
             config = config.model_copy(update={"softness": 0.0})
+        self.num_gaussians = self.num_gaussians or default_num_gaussians(*self.image.shape[1:])
         scene = fit(self.image, regions, self.num_gaussians, recipe=config, seed=self.seed).scene
         regions = scene.regions or regions  # a fit removes a map of one region
         return Scene(pad_rows(scene.field, self.num_gaussians, regions), regions)

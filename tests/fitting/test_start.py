@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kcgs import RegionMap
-from kcgs.fitting import initial_field
+from kcgs.fitting import FitConfig, initial_field, make_problem
 from kcgs.fitting.initial import random_field
 from kcgs.fitting.published.gradient_start import gradient_field
 from kcgs.functional import lookup_regions, region_splat
@@ -150,3 +150,9 @@ class TestInitialField:
         arguments = {"image": torch.zeros(3, 4, 4), "num_gaussians": 2, **change}
         with pytest.raises(error, match=words):
             initial_field(**arguments)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("size", "count"), [((6, 8), 48), ((32, 48), 100), ((200, 160), 320)])
+def test_the_number_of_gaussians_is_that_of_the_size(size: tuple[int, int], count: int) -> None:
+    assert make_problem(torch.rand(3, *size), None, None, FitConfig(), 0).num_gaussians == count
+    assert make_problem(torch.rand(2, 3, *size), None, None, FitConfig(), 0).num_gaussians == count
