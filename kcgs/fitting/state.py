@@ -42,6 +42,8 @@ class FitState(FieldState):
     """Cycles of removals and additions; 0 while the number of Gaussians still grows."""
     num_late_moves: int = 0
     """How often contours moved after densification."""
+    contour_seconds: list[float] = field(default_factory=list)
+    """Seconds that each move of the contours took, in a fit with a clock."""
     history: list[HistoryEntry] = field(default_factory=list)
     best: Best | None = None
     """The best scene of each image that was measured."""

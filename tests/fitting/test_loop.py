@@ -15,12 +15,14 @@ from torch import Tensor
 from kcgs import FitConfig, GaussianField, RegionMap, fit
 from kcgs.data import chart_2x3, chart_pie
 from kcgs.fitting import available_recipes
+from kcgs.fitting.events import contours
 from kcgs.fitting.problem import make_problem
 from kcgs.fitting.published.gaussian_image import GaussianImageAdan
 from kcgs.fitting.published.image_gs import ImageGSAdam
 from kcgs.fitting.published.warmup import Warmup
 from kcgs.fitting.start import start
 from kcgs.functional import ef_psnr, psnr
+from kcgs.optim import Renderer
 from tests.conftest import Clock
 
 
@@ -259,6 +261,25 @@ class TestStopping:
         monkeypatch.setattr("kcgs.fitting.loop.precompile", lambda config, device: clock.advance(100.0))
         result = fit(*disc(), 12, recipe=quick(iterations=10**7, max_seconds=0.5))
         assert clock.seconds > 100 and result.seconds < 1
+
+    @pytest.mark.parametrize(("seconds", "is_moved"), [(0.0, True), (0.2, True), (1.0, False)])
+    def test_contours_keep_to_their_share_of_the_clock(
+        self, clock: Clock, monkeypatch: pytest.MonkeyPatch, seconds: float, is_moved: bool
+    ) -> None:
+        """Of 3 seconds moves take 0.75 at most: they are left out where the first would take more."""
+        moves = []
+
+        def move(gaussians: object, renderer: Renderer, *_: object) -> RegionMap:
+            moves.append(seconds)
+            clock.advance(seconds)
+            assert renderer.regions is not None
+            return renderer.regions
+
+        image, labels = disc()
+        monkeypatch.setattr(contours, "move_contours", move)
+        monkeypatch.setattr(contours, "_SECONDS_PER_PIXEL", seconds / labels.numel())
+        result = fit(image, labels, 12, recipe="best", iterations=10**7, max_seconds=3.0)
+        assert result.stop_reason == "seconds" and bool(moves) == is_moved and sum(moves) <= 0.75
 
     def test_callback(self) -> None:
         image, labels = disc()

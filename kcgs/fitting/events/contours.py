@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from operator import is_not
@@ -14,6 +15,11 @@ from kcgs.fitting.start import with_chosen_softness
 from kcgs.fitting.state import FitState
 from kcgs.functional import RegionMap
 from kcgs.optim import Gaussians
+
+# of the clock of a fit so far: what moves of the contours may take
+_CLOCK_SHARE = 0.25
+# seconds per pixel that the first move is expected to take
+_SECONDS_PER_PIXEL = 3e-7
 
 
 @dataclass(frozen=True)
@@ -58,15 +64,26 @@ def _choose_softness(state: FitState, image: int, regions: RegionMap) -> RegionM
 def _move_contours(state: FitState, max_rise: float) -> None:
     """Move the contours where that raises the squared error about them by no more than a factor."""
     images, anchor, config = state.problem.image, state.anchor, state.problem.config
-    if state.regions is None or anchor is None or images is None:
+    if state.regions is None or anchor is None or images is None or not _has_time(state):
         return
-    gaussians = Gaussians.of(state.field)
+    start, gaussians = time.perf_counter(), Gaussians.of(state.field)
 
     def moved(state: FitState, image: int, regions: RegionMap) -> RegionMap:
         renderer, labels = state.renderer.of_image(image, regions), map_of(anchor, image).labels
         return move_contours(gaussians.of_image(image), renderer, images[image], labels, config, max_rise)
 
     _replace_maps(state, moved)
+    if config.max_seconds is not None:
+        state.contour_seconds.append(time.perf_counter() - start)
+
+
+def _has_time(state: FitState) -> bool:
+    """Whether another move of the contours keeps to their share of the clock, where there is one."""
+    max_seconds, seconds = state.problem.config.max_seconds, state.contour_seconds
+    if max_seconds is None:
+        return True
+    next_seconds = seconds[-1] if seconds else _SECONDS_PER_PIXEL * state.problem.canvas[:, 0].numel()
+    return sum(seconds) + next_seconds <= _CLOCK_SHARE * state.progress * max_seconds
 
 
 @dataclass(frozen=True)
@@ -82,7 +99,7 @@ class SettleContours:
     def act(self, state: FitState) -> None:
         """Move the contours, if it is time to."""
         move = state.num_late_moves + 1
-        time = self.after + (1 - self.after) * move / (self.num_moves + 1)
-        if move <= self.num_moves and state.progress >= time:
+        due = self.after + (1 - self.after) * move / (self.num_moves + 1)
+        if move <= self.num_moves and state.progress >= due:
             state.num_late_moves = move
             _move_contours(state, max_rise=1.0)
