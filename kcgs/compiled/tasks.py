@@ -135,7 +135,7 @@ def ranges(count: int, size: int) -> Any:
 
 
 @intrinsic
-def _add(typing_context, counters, place):  # type: ignore[no-untyped-def]
+def _add(typing_context, counters, place):
     """Add 1 to a counter at once for all threads; return what it was."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -145,7 +145,7 @@ def _add(typing_context, counters, place):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def _read(typing_context, counters, place):  # type: ignore[no-untyped-def]
+def _read(typing_context, counters, place):
     """Return a counter, which other threads change."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -155,7 +155,7 @@ def _read(typing_context, counters, place):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def _write(typing_context, counters, place, value):  # type: ignore[no-untyped-def]
+def _write(typing_context, counters, place, value):
     """Set a counter; what this thread wrote before is seen by those that read it."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -166,7 +166,7 @@ def _write(typing_context, counters, place, value):  # type: ignore[no-untyped-d
 
 
 @intrinsic
-def _yield_thread(typing_context):  # type: ignore[no-untyped-def]
+def _yield_thread(typing_context):
     """Let another thread have the processor."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -177,7 +177,7 @@ def _yield_thread(typing_context):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def _sleep(typing_context):  # type: ignore[no-untyped-def]
+def _sleep(typing_context):
     """Sleep for a moment."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -204,7 +204,7 @@ def _long(value: int) -> ir.Constant:
 
 
 @inner
-def _wait(counters, count):  # type: ignore[no-untyped-def]
+def _wait(counters, count):
     """Wait until so many tasks, from the first on, are done; return False if one has failed."""
     done: int = _read(counters, _DONE)  # type: ignore[call-arg]
     yields = 0
@@ -225,7 +225,7 @@ def _wait(counters, count):  # type: ignore[no-untyped-def]
 
 
 @inner
-def first_task(tasks, counters):  # type: ignore[no-untyped-def]
+def first_task(tasks, counters):
     """Take a task, and wait for those before it; return its number, or -1 when all are done or one has failed."""
     k: int = _add(counters, _TAKEN)  # type: ignore[call-arg]
     if k < len(tasks):
@@ -235,7 +235,7 @@ def first_task(tasks, counters):  # type: ignore[no-untyped-def]
 
 
 @inner
-def next_task(tasks, counters, k):  # type: ignore[no-untyped-def]
+def next_task(tasks, counters, k):
     """Say that task k is done, and take another one, as `first_task` does."""
     _write(counters, _FLAGS + k, 1)  # type: ignore[call-arg]
     return first_task(tasks, counters)

@@ -40,7 +40,7 @@ class CostTable(NamedTuple):
 
 
 @inner
-def _cost(costs, pixel, region):  # type: ignore[no-untyped-def]
+def _cost(costs, pixel, region):
     top, bottom, left, right = costs.boxes[region]
     y, x = pixel // costs.stride, pixel % costs.stride
     if not (top <= y < bottom and left <= x < right):
@@ -49,7 +49,7 @@ def _cost(costs, pixel, region):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _has(labels, pixel, offsets, label):  # type: ignore[no-untyped-def]
+def _has(labels, pixel, offsets, label):
     count = 0
     for offset in offsets:
         count += labels[pixel + offset] == label
@@ -57,14 +57,14 @@ def _has(labels, pixel, offsets, label):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _allows(limit, pixel, label):  # type: ignore[no-untyped-def]
+def _allows(limit, pixel, label):
     """True where a pixel may have a label: `limit` is a map, and offsets of a disc that holds it there, or none."""
     anchor, disc = limit
     return len(disc) == 0 or _has(anchor, pixel, disc, label)
 
 
 @program.entry
-def sweep_pixels(labels, costs, pair_cost, disc, limit, free, edges, neighborhood, state):  # type: ignore[no-untyped-def]
+def sweep_pixels(labels, costs, pair_cost, disc, limit, free, edges, neighborhood, state):
     """Give every free pixel the best label of its neighborhood; True if one changed.
 
     The map is flat and has a rim of -1; `edges` are the pixels that differ from the one right of them or below.
@@ -95,7 +95,7 @@ def sweep_pixels(labels, costs, pair_cost, disc, limit, free, edges, neighborhoo
 
 
 @inner
-def _list_near_contours(labels, free, edges, stride, neighborhood):  # type: ignore[no-untyped-def]
+def _list_near_contours(labels, free, edges, stride, neighborhood):
     """List the free pixels whose neighborhood holds the two sides of a contour, and a few more; with their parities."""
     pixels, parities = np.empty(len(labels), np.int64), np.empty(len(labels), np.uint8)
     is_listed, count = np.zeros(len(labels), np.bool_), 0
@@ -114,7 +114,7 @@ def _list_near_contours(labels, free, edges, stride, neighborhood):  # type: ign
 
 
 @inner
-def _change(labels, state, disc, neighborhood, pixel, label):  # type: ignore[no-untyped-def]
+def _change(labels, state, disc, neighborhood, pixel, label):
     """Give a pixel a label, and keep the state of the sweeps."""
     present, labels[pixel], state.excess[pixel] = labels[pixel], label, NOT_COUNTED
     for offset in neighborhood:
@@ -131,7 +131,7 @@ def _change(labels, state, disc, neighborhood, pixel, label):  # type: ignore[no
 
 
 @inner
-def _energy(labels, costs, pair_cost, disc, pixel, label):  # type: ignore[no-untyped-def]
+def _energy(labels, costs, pair_cost, disc, pixel, label):
     """Return the part of the energy that depends on a pixel's label, up to a constant, without curvature."""
     equal = 0
     for offset in disc[1:9]:
@@ -140,7 +140,7 @@ def _energy(labels, costs, pair_cost, disc, pixel, label):  # type: ignore[no-un
 
 
 @inner
-def _curved_energy(labels, state, costs, pair_cost, disc, pixel, label):  # type: ignore[no-untyped-def]
+def _curved_energy(labels, state, costs, pair_cost, disc, pixel, label):
     """Return the part of the energy that depends on a pixel's label, up to a constant."""
     present, excess, curvature = labels[pixel], 0, 0
     for offset in disc[1:]:
@@ -157,13 +157,13 @@ def _curved_energy(labels, state, costs, pair_cost, disc, pixel, label):  # type
 
 
 @inner
-def _curvature(labels, disc, pixel):  # type: ignore[no-untyped-def]
+def _curvature(labels, disc, pixel):
     """Return the square of how many more pixels around one differ from it than equal it; 0 if no more do."""
     return 0 if labels[pixel] == -1 else max(_count_excess(labels, disc, pixel), 0) ** 2
 
 
 @inner
-def _count_excess(labels, disc, pixel):  # type: ignore[no-untyped-def]
+def _count_excess(labels, disc, pixel):
     """Return how many more pixels around one differ from it than equal it."""
     excess, center = 0, labels[pixel]
     for offset in disc[1:]:
@@ -173,7 +173,7 @@ def _count_excess(labels, disc, pixel):  # type: ignore[no-untyped-def]
 
 
 @program.entry
-def piece_energy(labels, costs, pair_cost, disc, limit, piece, label):  # type: ignore[no-untyped-def]
+def piece_energy(labels, costs, pair_cost, disc, limit, piece, label):
     """Return the energy of a piece under a label, up to a constant, without curvature; infinite where not allowed."""
     total = 0.0
     for pixel in piece:
@@ -182,7 +182,7 @@ def piece_energy(labels, costs, pair_cost, disc, limit, piece, label):  # type: 
 
 
 @program.entry
-def map_energy_change(before, after, costs, pair_cost, disc):  # type: ignore[no-untyped-def]
+def map_energy_change(before, after, costs, pair_cost, disc):
     """Return the energy of a flat map with a rim of -1, less that of another."""
     change, is_counted = 0.0, np.zeros(len(after), np.bool_)
     for pixel in range(len(after)):
@@ -204,7 +204,7 @@ def map_energy_change(before, after, costs, pair_cost, disc):  # type: ignore[no
 
 
 @program.entry
-def find_small_pieces(labels, edges, stride, smallest):  # type: ignore[no-untyped-def]
+def find_small_pieces(labels, edges, stride, smallest):
     """Return the pixels of 4-connected pieces under `smallest` pixels, and the first pixel of each one's piece.
 
     The map is flat and has a rim of -1; `edges` are as for `sweep_pixels`. Every piece has a pixel beside another
@@ -233,7 +233,7 @@ def find_small_pieces(labels, edges, stride, smallest):  # type: ignore[no-untyp
 
 
 @inner
-def _fill(labels, stride, seed, state, queue):  # type: ignore[no-untyped-def]
+def _fill(labels, stride, seed, state, queue):
     """Fill the queue with the piece around a pixel; return how many pixels it has, 0 if it has more than fit."""
     queue[0], state[seed], count, k, is_large = seed, _PENDING, 1, 0, len(queue) == 1
     while k < count and not is_large:

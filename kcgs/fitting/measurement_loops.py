@@ -31,12 +31,12 @@ def mean_errors(rendered: Any, image: Any, band: Any, *, is_squared: bool) -> An
 
 
 @inner
-def _clipped_error(value, target):  # type: ignore[no-untyped-def]
+def _clipped_error(value, target):
     return (min(max(value, type(value)(0)), type(value)(1)) - target) ** 2
 
 
 @program.entry
-def _sum_columns(rendered, image, is_squared, loss, squares, tasks, counters):  # type: ignore[no-untyped-def]
+def _sum_columns(rendered, image, is_squared, loss, squares, tasks, counters):
     """Add up the errors of each column; tasks are ranges of columns, which are numbered through all images."""
     _, channels, height, width = rendered.shape
     k = first_task(tasks, counters)
@@ -54,7 +54,7 @@ def _sum_columns(rendered, image, is_squared, loss, squares, tasks, counters):  
 
 
 @program.entry
-def _mean(rendered, image, band, loss, squares):  # type: ignore[no-untyped-def]
+def _mean(rendered, image, band, loss, squares):
     """Return the means of columns, and those of the band."""
     batch, channels, height, width = rendered.shape
     means = np.empty((batch, 3))

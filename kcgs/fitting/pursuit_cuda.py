@@ -40,7 +40,7 @@ def blur(planes: Tensor, labels: Tensor | None, sigma: float, norm_sigma: float,
 
 
 @triton_function(warps=4)
-def _blur(  # type: ignore[no-untyped-def]
+def _blur(
     planes, labels, blurred, area, stride, length, labels_per_image, exponent, norm_exponent, reach,
     MAPPED: tl.constexpr, PIXELS: tl.constexpr,
 ):  # fmt: skip

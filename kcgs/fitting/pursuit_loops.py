@@ -37,7 +37,7 @@ def average(planes: Tensor, labels: Tensor, block: int) -> Tensor:
 
 
 @program.entry
-def _average(planes, labels, block, averages, tasks, counters):  # type: ignore[no-untyped-def]
+def _average(planes, labels, block, averages, tasks, counters):
     """Fill ranges of rows, which are numbered through all images."""
     _, count, height, width = averages.shape
     one, share = labels.dtype.type(1.0), labels.dtype.type(1.0 / block**2)
@@ -90,7 +90,7 @@ def evaluate(
 
 
 @program.entry
-def _evaluate(planes, labels, taps, gain, colors, tasks, counters):  # type: ignore[no-untyped-def]
+def _evaluate(planes, labels, taps, gain, colors, tasks, counters):
     """Fill ranges of rows, which are numbered through all images; each plane has its taps."""
     _, count, height, width = planes.shape
     reach, is_mapped = taps.shape[1] - 1, len(labels) > 0
@@ -121,27 +121,27 @@ def _evaluate(planes, labels, taps, gain, colors, tasks, counters):  # type: ign
 
 
 @inner
-def _compare(labels, others, is_same):  # type: ignore[no-untyped-def]
+def _compare(labels, others, is_same):
     """Set a row to 1 where two of labels are equal, and to 0 elsewhere."""
     for x in range(len(labels)):
         is_same[x] = labels[x] == others[x]
 
 
 @inner
-def _copy(values, target):  # type: ignore[no-untyped-def]
+def _copy(values, target):
     for plane in range(len(values)):
         for x in range(values.shape[1]):
             target[plane, x] = values[plane, x]
 
 
 @inner
-def _add(sums, values, is_same, tap):  # type: ignore[no-untyped-def]
+def _add(sums, values, is_same, tap):
     for x in range(len(sums)):
         sums[x] += tap * is_same[x] * values[x]
 
 
 @inner
-def _divide(products, norm, colors, gain):  # type: ignore[no-untyped-def]
+def _divide(products, norm, colors, gain):
     """Fill a row of colours, and add their gain to that of other channels."""
     for x in range(len(gain)):
         colors[x] = products[x] / norm[x]

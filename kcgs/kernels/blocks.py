@@ -12,7 +12,7 @@ program = Program("coarse grids")
 
 
 @program.entry
-def refine(starts, regions, num_regions, maps, grids):  # type: ignore[no-untyped-def]
+def refine(starts, regions, num_regions, maps, grids):
     """Return the last four of `coarse_grids.Blocks` for the first two of level 0."""
     last = grids[len(grids) - 1]
     tile_starts = np.empty(last[FIRST_TILE] + maps * last[TILE_ROWS] * last[TILE_COLS] + 1, np.int64)
@@ -58,13 +58,13 @@ def refine(starts, regions, num_regions, maps, grids):  # type: ignore[no-untype
 
 
 @inner
-def _place(t, grid):  # type: ignore[no-untyped-def]
+def _place(t, grid):
     """Return map, row and column of a tile."""
     return t // (grid[TILE_ROWS] * grid[TILE_COLS]), t // grid[TILE_COLS] % grid[TILE_ROWS], t % grid[TILE_COLS]
 
 
 @inner
-def _find_parents(blocks, tile_starts, tile, parent, parents):  # type: ignore[no-untyped-def]
+def _find_parents(blocks, tile_starts, tile, parent, parents):
     """Find the blocks of a tile among those of its parent, which has all their regions."""
     place = tile_starts[parent]
     for block in range(tile_starts[tile], tile_starts[tile + 1]):

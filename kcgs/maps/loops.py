@@ -16,7 +16,7 @@ SIDE = 16  # of a tile of `MapTable`: a number, so that the compiler makes vecto
 
 
 @program.entry
-def number_regions(labels, limit, index):  # type: ignore[no-untyped-def]
+def number_regions(labels, limit, index):
     """Fill the position of each pixel's label among the ids, which are returned; none unless all are in [0, limit).
 
     Labels, (N,), and index, (N,), are flat.
@@ -43,7 +43,7 @@ def number_regions(labels, limit, index):  # type: ignore[no-untyped-def]
 
 
 @program.entry
-def find_positions(region_ids, ids, limit, positions):  # type: ignore[no-untyped-def]
+def find_positions(region_ids, ids, limit, positions):
     """Fill the position of each id among sorted `ids`, -1 where it is not one of them; all are flat.
 
     Ids below a limit are looked up in a table.
@@ -62,7 +62,7 @@ def find_positions(region_ids, ids, limit, positions):  # type: ignore[no-untype
 
 
 @program.entry
-def list_regions(index, width_index, reaches, num_regions):  # type: ignore[no-untyped-def]
+def list_regions(index, width_index, reaches, num_regions):
     """Return the number of regions of each tile, (T,), and the regions, ascending, one tile after the other.
 
     A region belongs to a tile if it has a pixel within the reach of the tile's widest contour; `reaches` are those of
@@ -94,7 +94,7 @@ def list_regions(index, width_index, reaches, num_regions):  # type: ignore[no-u
 
 
 @program.entry
-def list_window_regions(starts, regions, shape, places, span, num_regions):  # type: ignore[no-untyped-def]
+def list_window_regions(starts, regions, shape, places, span, num_regions):
     """Return the same for windows of `span` pixels at places, (T, 3): the regions of the tiles that they touch.
 
     Args:
@@ -125,7 +125,7 @@ def list_window_regions(starts, regions, shape, places, span, num_regions):  # t
 
 
 @inner
-def _insert(values, first, end, value):  # type: ignore[no-untyped-def]
+def _insert(values, first, end, value):
     """Insert into values[first:end], which ascend; return the array, or a larger one."""
     if end == len(values):
         values = np.append(values, np.empty_like(values))
@@ -138,7 +138,7 @@ def _insert(values, first, end, value):  # type: ignore[no-untyped-def]
 
 
 @program.entry
-def cut_windows(starts, regions, planes, weights, shape, places, members, windows, tasks, counters):  # type: ignore[no-untyped-def]
+def cut_windows(starts, regions, planes, weights, shape, places, members, windows, tasks, counters):
     """Fill the membership of regions, (P,), over windows, (P, h, w), at places, (P, 3), out of a `MapTable`.
 
     `shape` is as of `list_window_regions`; membership is 0 beyond the tiles. Tasks are ranges of windows.
@@ -160,7 +160,7 @@ def cut_windows(starts, regions, planes, weights, shape, places, members, window
 
 
 @inner
-def _copy_plane(plane, weights, top, left, window):  # type: ignore[no-untyped-def]
+def _copy_plane(plane, weights, top, left, window):
     """Copy what of a tile lies in a window."""
     height, width = window.shape
     for y in range(max(top, 0), min(top + SIDE, height)):
@@ -169,7 +169,7 @@ def _copy_plane(plane, weights, top, left, window):  # type: ignore[no-untyped-d
 
 
 @program.entry
-def fill_planes(index, smooth, width_index, taps, starts, regions, planes, weights, tasks, counters):  # type: ignore[no-untyped-def]
+def fill_planes(index, smooth, width_index, taps, starts, regions, planes, weights, tasks, counters):
     """Fill the membership of regions in the tiles of a `MapTable` that several share.
 
     Labels are those of `index`, or, where the arrays of `smooth`, a tuple as of `SmoothLabels`, are not empty, those.
@@ -224,7 +224,7 @@ def fill_planes(index, smooth, width_index, taps, starts, regions, planes, weigh
 
 
 @inner
-def _read(image, top, left, side, outside, square):  # type: ignore[no-untyped-def]
+def _read(image, top, left, side, outside, square):
     """Read a square of an image, with a value beyond it."""
     first, end = max(-left, 0), min(side, image.shape[1] - left)
     for y in range(side):
@@ -234,14 +234,14 @@ def _read(image, top, left, side, outside, square):  # type: ignore[no-untyped-d
 
 
 @inner
-def _mark_members(labels, region, weights):  # type: ignore[no-untyped-def]
+def _mark_members(labels, region, weights):
     """Fill the weights of a tile with hard contours."""
     for k in range(SIDE * SIDE):
         weights[k] = labels[k] == region
 
 
 @inner
-def _find_members(labels, region, member):  # type: ignore[no-untyped-def]
+def _find_members(labels, region, member):
     """Mark the pixels of a line that are of a region; return their number."""
     count = 0
     for x in range(len(member)):
@@ -251,7 +251,7 @@ def _find_members(labels, region, member):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _share(labels, own_shares, others, other_shares, region, member):  # type: ignore[no-untyped-def]
+def _share(labels, own_shares, others, other_shares, region, member):
     """Fill how much of each pixel of a line is of a region."""
     for x in range(len(member)):
         other = other_shares[x] if others[x] == region else 0.0
@@ -259,7 +259,7 @@ def _share(labels, own_shares, others, other_shares, region, member):  # type: i
 
 
 @inner
-def _blur(half, line, blurred):  # type: ignore[no-untyped-def]
+def _blur(half, line, blurred):
     """Blur a line to the pixels of a tile."""
     n = len(half) - 1
     for x in range(SIDE):
@@ -271,7 +271,7 @@ def _blur(half, line, blurred):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _blur_rows(half, rows, is_empty, blurred):  # type: ignore[no-untyped-def]
+def _blur_rows(half, rows, is_empty, blurred):
     """Blur the rows of a tile's window to those of the tile."""
     n = len(half) - 1
     for y in range(SIDE):
@@ -286,14 +286,14 @@ def _blur_rows(half, rows, is_empty, blurred):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _divide(total, down, across):  # type: ignore[no-untyped-def]
+def _divide(total, down, across):
     for y in range(SIDE):
         for x in range(SIDE):
             total[y, x] /= max(down[y] * across[x], 1e-300)
 
 
 @inner
-def _copy_pixels(total, width_index, k, place, weights):  # type: ignore[no-untyped-def]
+def _copy_pixels(total, width_index, k, place, weights):
     """Copy the pixels of a width; where there is one, all."""
     image, top, left = place
     for y in range(SIDE):
@@ -303,7 +303,7 @@ def _copy_pixels(total, width_index, k, place, weights):  # type: ignore[no-unty
 
 
 @inner
-def _sum_inside(half, first, length):  # type: ignore[no-untyped-def]
+def _sum_inside(half, first, length):
     """Sum the taps that lie inside of an axis, around each pixel of a tile."""
     line = np.zeros(SIDE + 2 * len(half) - 2)
     begin = len(half) - 1 - first
@@ -314,13 +314,13 @@ def _sum_inside(half, first, length):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _width(width_index, row, col):  # type: ignore[no-untyped-def]
+def _width(width_index, row, col):
     """Return the width of a pixel; beyond the image the border repeats."""
     return width_index[min(max(row, 0), width_index.shape[0] - 1), min(max(col, 0), width_index.shape[1] - 1)]
 
 
 @inner
-def _has_width(width_index, k, top, left):  # type: ignore[no-untyped-def]
+def _has_width(width_index, k, top, left):
     for y in range(top, top + SIDE):
         for x in range(left, left + SIDE):
             if _width(width_index, y, x) == k:
@@ -329,7 +329,7 @@ def _has_width(width_index, k, top, left):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _widest(width_index, top, left):  # type: ignore[no-untyped-def]
+def _widest(width_index, top, left):
     """Return the largest width of a tile."""
     widest = 0
     for y in range(top, min(top + SIDE, width_index.shape[0])):

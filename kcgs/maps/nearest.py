@@ -10,7 +10,7 @@ program = Program("tables of label maps")
 
 
 @program.entry
-def spread(values, nearest):  # type: ignore[no-untyped-def]
+def spread(values, nearest):
     """Fill nearest, (maps, H, W), with the values of the nearest pixels that have one, not -1; else it stays.
 
     Of pixels equally near the leftmost counts, then the uppermost, as in scipy's distance transform.
@@ -31,7 +31,7 @@ def spread(values, nearest):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _find_rows(values, rows, below):  # type: ignore[no-untyped-def]
+def _find_rows(values, rows, below):
     """Fill the row of the nearest pixel with a value in each pixel's column; -1: there is none."""
     height, width = values.shape
     below[:] = -1
@@ -49,7 +49,7 @@ def _find_rows(values, rows, below):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _find_columns(rows, y, columns, begins):  # type: ignore[no-untyped-def]
+def _find_columns(rows, y, columns, begins):
     """List the columns whose nearest pixels are the nearest ones of a row, and where each begins to be; their number.
 
     Source: Meijster, Roerdink, Hesselink, "A general algorithm for computing distance transforms in linear time".

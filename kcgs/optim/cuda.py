@@ -48,7 +48,7 @@ def step(tables: list[Tensor], gradients: list[Tensor | None], geometry: Adam, c
 
 
 @triton.jit  # type: ignore[untyped-decorator]
-def _gradient(gradients, place, mask, EXISTS: tl.constexpr):  # type: ignore[no-untyped-def]
+def _gradient(gradients, place, mask, EXISTS: tl.constexpr):
     if EXISTS:
         return tl.load(gradients + place, mask=mask, other=0.0).to(tl.float64)
     else:
@@ -56,7 +56,7 @@ def _gradient(gradients, place, mask, EXISTS: tl.constexpr):  # type: ignore[no-
 
 
 @triton.jit  # type: ignore[untyped-decorator]
-def _rate(lr, beta1, beta2, age, LOADED: tl.constexpr):  # type: ignore[no-untyped-def]
+def _rate(lr, beta1, beta2, age, LOADED: tl.constexpr):
     """Return the learning rate over the first average's correction, and the inverse root of the second one's."""
     if LOADED:
         lr = tl.load(lr)
@@ -66,7 +66,7 @@ def _rate(lr, beta1, beta2, age, LOADED: tl.constexpr):  # type: ignore[no-untyp
 
 
 @triton.jit
-def _move(gradient, averages, squares, place, mask, rate, root, beta1, beta2, eps):  # type: ignore[no-untyped-def]
+def _move(gradient, averages, squares, place, mask, rate, root, beta1, beta2, eps):
     """Update the averages of a column, and return Adam's step."""
     average = tl.load(averages + place, mask=mask, other=0.0).to(tl.float64)
     square = tl.load(squares + place, mask=mask, other=0.0).to(tl.float64)
@@ -78,24 +78,24 @@ def _move(gradient, averages, squares, place, mask, rate, root, beta1, beta2, ep
 
 
 @triton.jit
-def _clamp(value, low, high):  # type: ignore[no-untyped-def]
+def _clamp(value, low, high):
     return tl.where(value < low, low, tl.where(value > high, high, value))  # NaN stays NaN
 
 
 @triton.jit
-def _store(table, place, value, mask):  # type: ignore[no-untyped-def]
+def _store(table, place, value, mask):
     """Write numbers, but none that is not finite in float32."""
     value = value.to(tl.float32)
     tl.store(table + place, value, mask=mask & (tl.abs(value) < float("inf")))
 
 
 @triton.jit
-def _add(table, place, change, mask):  # type: ignore[no-untyped-def]
+def _add(table, place, change, mask):
     _store(table, place, tl.load(table + place, mask=mask, other=0.0) + change, mask)
 
 
 @triton_function(warps=4)
-def _step(  # type: ignore[no-untyped-def]
+def _step(
     means, cholesky, colors, opacities, means_gradient, cholesky_gradient, colors_gradient, opacities_gradient,
     lr, beta1, beta2, eps, age, average, square,
     color_lr, color_beta1, color_beta2, color_eps, color_age, color_average, color_square,

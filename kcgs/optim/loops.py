@@ -16,12 +16,12 @@ program = Program("optimizer")
 
 
 @inner
-def _clamp(value, low, high):  # type: ignore[no-untyped-def]
+def _clamp(value, low, high):
     return min(max(value, low), high)  # NaN stays NaN
 
 
 @inner
-def _move(numbers, average, square, adam, age):  # type: ignore[no-untyped-def]
+def _move(numbers, average, square, adam, age):
     """Put Adam's step in the place of each gradient of a row, and update its averages, all of one age."""
     rate, root = adam.lr / (1.0 - adam.beta1**age), 1.0 / math.sqrt(1.0 - adam.beta2**age)
     for i in range(len(numbers)):
@@ -33,7 +33,7 @@ def _move(numbers, average, square, adam, age):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _step(numbers, adam, begin):  # type: ignore[no-untyped-def]
+def _step(numbers, adam, begin):
     """Put Adam's steps in the place of gradients [N, K], of rows from `begin` on; rows of one age go together.
 
     Rows of a negative age are frozen: their step is 0.
@@ -54,7 +54,7 @@ def _step(numbers, adam, begin):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _widen(l11, l21, l22, min_sigma):  # type: ignore[no-untyped-def]
+def _widen(l11, l21, l22, min_sigma):
     """Return a factor whose standard deviations are at least `min_sigma`, as `frame.widen` does."""
     xx, xy, yy, least = l11 * l11, l11 * l21, l21 * l21 + l22 * l22, min_sigma * min_sigma
     if xx >= least and (xx - least) * (yy - least) >= xy * xy:
@@ -70,7 +70,7 @@ def _widen(l11, l21, l22, min_sigma):  # type: ignore[no-untyped-def]
 
 
 @program.entry
-def is_within(tables, limit):  # type: ignore[no-untyped-def]
+def is_within(tables, limit):
     """True where every number of rows is smaller than a limit, and not NaN."""
     within = True
     for numbers in tables:
@@ -80,7 +80,7 @@ def is_within(tables, limit):  # type: ignore[no-untyped-def]
 
 
 @program.entry
-def step_geometry(means, cholesky, means_gradient, cholesky_gradient, moves, adam, bounds, tasks, counters):  # type: ignore[no-untyped-def]
+def step_geometry(means, cholesky, means_gradient, cholesky_gradient, moves, adam, bounds, tasks, counters):
     """Move means [N, 2] and factors [N, 3]; `moves` says which of the two is not frozen. Tasks are ranges of rows."""
     k = first_task(tasks, counters)
     while k >= 0:
@@ -90,7 +90,7 @@ def step_geometry(means, cholesky, means_gradient, cholesky_gradient, moves, ada
 
 
 @inner
-def _step_geometry(means, cholesky, means_gradient, cholesky_gradient, moves, adam, bounds, rows):  # type: ignore[no-untyped-def]
+def _step_geometry(means, cholesky, means_gradient, cholesky_gradient, moves, adam, bounds, rows):
     begin, end = rows
     steps = np.empty((end - begin, 5), np.float32)
     for i in range(begin, end):
@@ -121,7 +121,7 @@ def _step_geometry(means, cholesky, means_gradient, cholesky_gradient, moves, ad
 
 
 @program.entry
-def step_tables(tables, gradient, adam):  # type: ignore[no-untyped-def]
+def step_tables(tables, gradient, adam):
     """Move tables of rows whose gradients [N, K] are beside each other."""
     steps, column = gradient.copy(), 0
     _step(steps, adam, 0)

@@ -54,20 +54,20 @@ class Scales(NamedTuple):
 
 
 @inner
-def _taps(scales):  # type: ignore[no-untyped-def]
+def _taps(scales):
     """Return the taps as numbers: in an array a store to another one might change them."""
     taps = scales.taps
     return taps[0], taps[1], taps[2], taps[3], taps[4], taps[5]
 
 
 @inner
-def _at(plane, other, y, x):  # type: ignore[no-untyped-def]
+def _at(plane, other, y, x):
     """Return a value of a plane, or of its product with another."""
     return plane[y, x] if other is None else plane[y, x] * other[y, x]
 
 
 @inner
-def _down(plane, other, y, taps, upper, lower):  # type: ignore[no-untyped-def]
+def _down(plane, other, y, taps, upper, lower):
     """Blur a padded plane, or the product of two, along columns, at rows y and y + 2."""
     for x in range(plane.shape[1]):
         first, second = taps[0] * _at(plane, other, y + MARGIN, x), taps[0] * _at(plane, other, y + MARGIN + 2, x)
@@ -79,7 +79,7 @@ def _down(plane, other, y, taps, upper, lower):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _across(row, taps, target):  # type: ignore[no-untyped-def]
+def _across(row, taps, target):
     """Blur a row of a padded plane, for the windows of a row."""
     for x in range(len(target)):
         k = 2 * x
@@ -89,7 +89,7 @@ def _across(row, taps, target):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _up(slopes, k, taps, upper, lower):  # type: ignore[no-untyped-def]
+def _up(slopes, k, taps, upper, lower):
     """Spread windows along columns to the row of pixels of window row k + 2, and the next."""
     for x in range(slopes.shape[1]):
         a, b, c = slopes[k, x], slopes[k + 1, x], slopes[k + 2, x]
@@ -99,7 +99,7 @@ def _up(slopes, k, taps, upper, lower):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _along(row, taps, target):  # type: ignore[no-untyped-def]
+def _along(row, taps, target):
     """Spread windows along a row to its columns; three zeros lie on either side."""
     for x in range(len(target) // 2):
         a, b, c, d, e, f = row[x + 1], row[x + 2], row[x + 3], row[x + 4], row[x + 5], row[x + 6]
@@ -108,7 +108,7 @@ def _along(row, taps, target):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _plane(scales, scale, channel):  # type: ignore[no-untyped-def]
+def _plane(scales, scale, channel):
     """Return a plane of averages of the difference, or of the gradient."""
     table = scales.table
     height, width = table[scale, HEIGHT], table[scale, WIDTH]
@@ -117,7 +117,7 @@ def _plane(scales, scale, channel):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _padded(flat, scales, scale, channel):  # type: ignore[no-untyped-def]
+def _padded(flat, scales, scale, channel):
     """Return a padded plane."""
     table = scales.table
     height, width = table[scale, HEIGHT] + PADDING, table[scale, WIDTH] + 2 * MARGIN
@@ -126,7 +126,7 @@ def _padded(flat, scales, scale, channel):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _windows(flat, scales, scale, index, count):  # type: ignore[no-untyped-def]
+def _windows(flat, scales, scale, index, count):
     """Return a number of the windows of a scale, one of `count`."""
     table = scales.table
     height, width = (table[scale, HEIGHT] + 1) // 2, (table[scale, WIDTH] + 1) // 2
@@ -135,7 +135,7 @@ def _windows(flat, scales, scale, index, count):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _halve(scales, difference, channel, first, last):  # type: ignore[no-untyped-def]
+def _halve(scales, difference, channel, first, last):
     """Fill rows of all scales, those of the finest from first to last: averages of blocks, and the render."""
     table, quarter = scales.table, np.float32(0.25)
     for scale in range(len(table)):
@@ -153,7 +153,7 @@ def _halve(scales, difference, channel, first, last):  # type: ignore[no-untyped
 
 
 @inner
-def _differentiate(rows, inside, mean, variance, scores, slopes):  # type: ignore[no-untyped-def]
+def _differentiate(rows, inside, mean, variance, scores, slopes):
     """Fill a row of scores, and of their slopes by mean square, mean product and mean of the render."""
     means, squares, products = rows[0], rows[1], rows[2]
     by_square, by_product, by_mean = slopes
@@ -171,7 +171,7 @@ def _differentiate(rows, inside, mean, variance, scores, slopes):  # type: ignor
 
 
 @inner
-def _brighten(means, inside, mean, scores, slopes):  # type: ignore[no-untyped-def]
+def _brighten(means, inside, mean, scores, slopes):
     """Multiply a row of scores by the luminance."""
     by_square, by_product, by_mean = slopes
     two, c1 = np.float32(2.0), np.float32(K1**2)
@@ -187,7 +187,7 @@ def _brighten(means, inside, mean, scores, slopes):  # type: ignore[no-untyped-d
 
 
 @inner
-def _score(scales, scale, channel, first, last, has_gradient):  # type: ignore[no-untyped-def]
+def _score(scales, scale, channel, first, last, has_gradient):
     """Fill rows of the gradient by the pixels of a scale, the first even; return the sum of the scores of windows."""
     taps = _taps(scales)
     render = _padded(scales.render, scales, scale, channel)
@@ -228,7 +228,7 @@ def _score(scales, scale, channel, first, last, has_gradient):  # type: ignore[n
 
 
 @inner
-def _spread(scales, scale, channel, first, last, slopes):  # type: ignore[no-untyped-def]
+def _spread(scales, scale, channel, first, last, slopes):
     """Fill rows of the gradient by the pixels of a scale, from the slopes of the scores of windows."""
     taps = _taps(scales)
     render = _padded(scales.render, scales, scale, channel)
@@ -246,7 +246,7 @@ def _spread(scales, scale, channel, first, last, slopes):  # type: ignore[no-unt
 
 
 @inner
-def _combine(rows, render, image, target):  # type: ignore[no-untyped-def]
+def _combine(rows, render, image, target):
     """Turn three rows of slopes, by mean square, mean product and mean, into the gradient."""
     by_square, by_product, by_mean = rows[0], rows[1], rows[2]
     for x in range(len(target)):
@@ -254,7 +254,7 @@ def _combine(rows, render, image, target):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _mean_score(scales, sums, tasks, scale, channel):  # type: ignore[no-untyped-def]
+def _mean_score(scales, sums, tasks, scale, channel):
     total = 0.0
     for k in range(len(tasks)):
         if tasks[k, PHASE] == SCORE and tasks[k, SCALE] == scale and tasks[k, CHANNEL] == channel:
@@ -264,7 +264,7 @@ def _mean_score(scales, sums, tasks, scale, channel):  # type: ignore[no-untyped
 
 
 @inner
-def _add(row, factor, coarse):  # type: ignore[no-untyped-def]
+def _add(row, factor, coarse):
     """Multiply a row by a factor, and add to it what the blocks of a coarser one have."""
     for x in range(len(coarse)):
         row[2 * x] = row[2 * x] * factor + coarse[x]
@@ -274,7 +274,7 @@ def _add(row, factor, coarse):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _sum(scales, difference, squared, sums, tasks, k):  # type: ignore[no-untyped-def]
+def _sum(scales, difference, squared, sums, tasks, k):
     """Fill rows of the gradient by the image's pixels: the coarser scales' are added to the finer ones'."""
     table, channel = scales.table, tasks[k, CHANNEL]
     first, last = tasks[k, FIRST], tasks[k, LAST]
@@ -294,7 +294,7 @@ def _sum(scales, difference, squared, sums, tasks, k):  # type: ignore[no-untype
 
 
 @program.entry
-def run_phases(scales, difference, squared, sums, has_gradient, tasks, counters):  # type: ignore[no-untyped-def]
+def run_phases(scales, difference, squared, sums, has_gradient, tasks, counters):
     """Fill the sums of scores, (T,) by task; with the last phase replace a difference by half the gradient."""
     k = first_task(tasks, counters)
     while k >= 0:

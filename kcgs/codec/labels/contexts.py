@@ -91,7 +91,7 @@ _STRETCH = (np.searchsorted(SQUASH, np.arange(4096) * 16 + 8) - MAX_LOGIT).astyp
 
 
 @inner
-def is_quiet(labels, y, x):  # type: ignore[no-untyped-def]
+def is_quiet(labels, y, x):
     """True if the neighbours of (x, y) that come before it have one label."""
     label = labels[y, x - 1]
     for i in range(x - 2, x + 8):
@@ -104,7 +104,7 @@ def is_quiet(labels, y, x):  # type: ignore[no-untyped-def]
 
 
 @inner
-def find_features(labels, pixel):  # type: ignore[no-untyped-def]
+def find_features(labels, pixel):
     """Fill in the candidates of a pixel and its features."""
     y, x, features = pixel.y, pixel.x, pixel.features
     first = labels[y, x - 1]
@@ -131,7 +131,7 @@ def make_network(prior: tuple[Any, ...]) -> Any:
     num_hidden, num_latent = layer2.shape
 
     @inner
-    def network(pixel, units):  # type: ignore[no-untyped-def]
+    def network(pixel, units):
         # lengths unknown to the compiler: it would unroll loops of known length, without vectors, and be 3 times slower
         latent, hidden = units[: len(units) - num_hidden], units[num_latent:]
         features, estimates = pixel.features, pixel.estimates
@@ -165,7 +165,7 @@ file_network = make_network(load_prior("map_file_prior.bin"))
 
 
 @inner
-def find_counters(pixel):  # type: ignore[no-untyped-def]
+def find_counters(pixel):
     """Fill in the counters of a pixel: those of the contexts that its features are in."""
     features, counters = pixel.features, pixel.counters
     bits = 0
@@ -188,7 +188,7 @@ def find_counters(pixel):  # type: ignore[no-untyped-def]
 
 
 @inner
-def mix(counters, mixer, pixel, decision):  # type: ignore[no-untyped-def]
+def mix(counters, mixer, pixel, decision):
     """Mix the estimates of the network and of the counters; return the chance of a 1."""
     estimates, rows = pixel.estimates[decision], pixel.counters[decision]
     age: Any = 0
@@ -208,7 +208,7 @@ def mix(counters, mixer, pixel, decision):  # type: ignore[no-untyped-def]
 
 
 @inner
-def learn(counters, mixer, pixel, decision, bit):  # type: ignore[no-untyped-def]
+def learn(counters, mixer, pixel, decision, bit):
     """Move the mixer's weights along the error, and the counters towards the bit."""
     estimates, rows = pixel.estimates[decision], pixel.counters[decision]
     error = (bit << 16) - pixel.chance[decision]

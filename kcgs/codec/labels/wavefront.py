@@ -92,7 +92,7 @@ program = Program("label coder")
 
 
 @program.entry
-def advance(scan, bits, truth):  # type: ignore[no-untyped-def]
+def advance(scan, bits, truth):
     """Label the present wavefront by its bits, go on to the next that has seeds or coded pixels, return their number.
 
     `truth` holds the regions' numbers; a decoder's is empty.
@@ -110,7 +110,7 @@ def advance(scan, bits, truth):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _label_pixels(scan, bits):  # type: ignore[no-untyped-def]
+def _label_pixels(scan, bits):
     """Give the wavefront's pixels their labels and learn from them."""
     labels, lines, state = scan.labels, scan.lines, scan.state
     num_escapes = state.num_coded if state.num_regions > 2 else 0
@@ -137,7 +137,7 @@ def _label_pixels(scan, bits):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _find_pixels(scan):  # type: ignore[no-untyped-def]
+def _find_pixels(scan):
     """List the seeds and coded pixels of a wavefront; the others have their label, since rows continue."""
     labels, seeds, lines, state = scan.labels, scan.seeds, scan.lines, scan.state
     height, width = seeds.shape
@@ -174,7 +174,7 @@ def _find_pixels(scan):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _is_still_quiet(labels, lines, y, x):  # type: ignore[no-untyped-def]
+def _is_still_quiet(labels, lines, y, x):
     """Return what `is_quiet` does, by the last change in each row, which in the row above is within its reach."""
     if y < TOP + 2:
         return is_quiet(labels, y, x)
@@ -187,14 +187,14 @@ def _is_still_quiet(labels, lines, y, x):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _continue(labels, lines, y, x, label):  # type: ignore[no-untyped-def]
+def _continue(labels, lines, y, x, label):
     """Write a label at a pixel and ahead of it."""
     labels[y, x : x + _AHEAD] = label
     lines[y].end = x + _AHEAD
 
 
 @inner
-def _fill_margins(labels, y, x, label):  # type: ignore[no-untyped-def]
+def _fill_margins(labels, y, x, label):
     """Repeat the label of a pixel in the margins above and left of the map."""
     if y == TOP:
         labels[:TOP, x : x + RIGHT + 1] = label
@@ -203,7 +203,7 @@ def _fill_margins(labels, y, x, label):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _estimate(scan, truth):  # type: ignore[no-untyped-def]
+def _estimate(scan, truth):
     """Fill in chances, and answers where the truth is known: first whether pixels escape, then which candidate."""
     state, chances, answers = scan.state, scan.chances, scan.answers
     num_escapes = state.num_coded if state.num_regions > 2 else 0
@@ -227,7 +227,7 @@ def _estimate(scan, truth):  # type: ignore[no-untyped-def]
 
 
 @program.entry
-def find_nearest(labels, pixel, nearest):  # type: ignore[no-untyped-def]
+def find_nearest(labels, pixel, nearest):
     """Fill in up to MAX_NEAREST labels other than the candidates, by distance from a pixel; return their number."""
     count = 0
     for radius in range(1, _MAX_RADIUS + 1):
@@ -250,7 +250,7 @@ def find_nearest(labels, pixel, nearest):  # type: ignore[no-untyped-def]
 
 
 @program.entry
-def number_regions(index, num_regions):  # type: ignore[no-untyped-def]
+def number_regions(index, num_regions):
     """Number the regions as wavefronts meet them, and mark seeds.
 
     Returns the number of each pixel's region, the seeds, and the position of each numbered region in `index`.

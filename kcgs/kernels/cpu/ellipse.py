@@ -31,20 +31,20 @@ _MARGIN = 1e-3
 
 
 @inline
-def bounded(value):  # type: ignore[no-untyped-def]
+def bounded(value):
     """Clamp a coefficient of z."""
     return min(max(value, -Z_LIMIT), Z_LIMIT)
 
 
 @inline
-def _highest(along, across, peak, low, high, radius):  # type: ignore[no-untyped-def]
+def _highest(along, across, peak, low, high, radius):
     """Return the largest along * u + across * sqrt(radius^2 - u^2), which peaks at u = peak, over [low, high]."""
     u = min(max(peak, low), high)
     return along * u + across * math.sqrt(max(radius * radius - u * u, 0.0))
 
 
 @inline
-def tile_rows(g, height, width, radius):  # type: ignore[no-untyped-def]
+def tile_rows(g, height, width, radius):
     """Return the rows of tiles, first and last + 1, that the bounding box crosses; 0, 0: none."""
     reach, spread = g[SIGMA_Y] * radius + _MARGIN, g[L11] * radius + _MARGIN
     first = math.ceil(max(g[MEAN_Y] - reach - 0.5, 0.0))
@@ -55,7 +55,7 @@ def tile_rows(g, height, width, radius):  # type: ignore[no-untyped-def]
 
 
 @inline
-def row_halves(g, row, height, width, radius):  # type: ignore[no-untyped-def]
+def row_halves(g, row, height, width, radius):
     """Return the halves of tiles, first and last + 1, that the ellipse may cross in a row of tiles."""
     spread = g[L11] * radius + _MARGIN
     first, last = max(g[MEAN_X] - spread - 0.5, 0.0), min(g[MEAN_X] + spread - 0.5, width - 1.0)
@@ -74,7 +74,7 @@ def row_halves(g, row, height, width, radius):  # type: ignore[no-untyped-def]
 
 
 @inline
-def block_rows(g, row, col, height, width, radius):  # type: ignore[no-untyped-def]
+def block_rows(g, row, col, height, width, radius):
     """Return the rows of a block, first and last + 1, that the ellipse crosses; first >= last: none."""
     left = max((col * SIDE + 0.5 - _MARGIN - g[MEAN_X]) * g[INVERSE_L11], -radius)
     right = min((min(col * SIDE + SIDE, width) - 0.5 + _MARGIN - g[MEAN_X]) * g[INVERSE_L11], radius)
@@ -89,7 +89,7 @@ def block_rows(g, row, col, height, width, radius):  # type: ignore[no-untyped-d
 
 
 @inline
-def enter(g, row, col, first, shape):  # type: ignore[no-untyped-def]
+def enter(g, row, col, first, shape):
     """Set `shape`, float32, to k of z1 = k0 + k1 x and z2 = k2 + k3 x + k4 y, to CHANGE, and to y of the first row.
 
     z is times SCALE; x and y are counted from the block's middle.

@@ -22,7 +22,7 @@ class Backward(NamedTuple):
 
 
 @inner
-def sum_terms(lists, backward, terms, begin, end):  # type: ignore[no-untyped-def]
+def sum_terms(lists, backward, terms, begin, end):
     """Add up the terms of some Gaussians in float64 and turn them into gradients; docs/performance.md has the formulas.
 
     Args:
@@ -58,7 +58,7 @@ def sum_terms(lists, backward, terms, begin, end):  # type: ignore[no-untyped-de
 
 
 @inner
-def _uncoarsen(g, fine, mean, factor, by_factor):  # type: ignore[no-untyped-def]
+def _uncoarsen(g, fine, mean, factor, by_factor):
     """Turn the gradients of a mean and a factor on their level into those in pixels, back through coarse_grids.coarsen.
 
     `fine` is the factor in pixels, `by_factor` the gradient of COLOR_FACTOR.

@@ -44,7 +44,7 @@ _NORMAL_RADIUS = 13.1
 
 
 @program.entry
-def arrange(batch, rows, cols):  # type: ignore[no-untyped-def]
+def arrange(batch, rows, cols):
     """Return whether all is finite and within the limits of whitened.py, and if so the `order` of Lists.
 
     Args:
@@ -71,7 +71,7 @@ def arrange(batch, rows, cols):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _in_range(means, cholesky, colors):  # type: ignore[no-untyped-def]
+def _in_range(means, cholesky, colors):
     least, largest = LEAST_SCALE, SCALE_LIMITS[1]
     is_valid = True
     for i in range(len(means)):  # written so that NaN fails
@@ -85,7 +85,7 @@ def _in_range(means, cholesky, colors):  # type: ignore[no-untyped-def]
 
 
 @program.entry
-def measure(batch, table, radius, spacing, order, gaussians, colors, spans, counts, tasks, counters):  # type: ignore[no-untyped-def]
+def measure(batch, table, radius, spacing, order, gaussians, colors, spans, counts, tasks, counters):
     """Fill gaussians and colors of Lists, the rows of blocks that each Gaussian may touch, and how many blocks.
 
     Args:
@@ -122,7 +122,7 @@ def measure(batch, table, radius, spacing, order, gaussians, colors, spans, coun
 
 
 @program.entry
-def list_pairs(batch, radius, spans, blocks, histogram, lists, tasks, counters):  # type: ignore[no-untyped-def]
+def list_pairs(batch, radius, spans, blocks, histogram, lists, tasks, counters):
     """Fill start, pairs, shapes, num_terms and live of Lists.
 
     Args:
@@ -148,7 +148,7 @@ def list_pairs(batch, radius, spans, blocks, histogram, lists, tasks, counters):
 
 
 @inner
-def _find_blocks(batch, radius, spans, blocks, histogram, lists, begin, end):  # type: ignore[no-untyped-def]
+def _find_blocks(batch, radius, spans, blocks, histogram, lists, begin, end):
     table, per_image = lists.table, max(len(lists.order) // batch.num_images, 1)
     grids = table.grids
     num_regions, tile_start, block_regions = table.num_regions, table.tile_start, table.regions
@@ -176,7 +176,7 @@ def _find_blocks(batch, radius, spans, blocks, histogram, lists, begin, end):  #
 
 
 @inner
-def _sum_histogram(histogram, lists):  # type: ignore[no-untyped-def]
+def _sum_histogram(histogram, lists):
     """Turn numbers of pairs into places of the first, set `start`, and mark the blocks of nodes that are not zero."""
     table, start, live = lists.table, lists.start, lists.live
     # along rows of the histogram, which are vectors
@@ -205,7 +205,7 @@ def _sum_histogram(histogram, lists):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _place_pairs(radius, blocks, places, lists, begin, end):  # type: ignore[no-untyped-def]
+def _place_pairs(radius, blocks, places, lists, begin, end):
     for i in range(begin, end):
         first = lists.first_terms[i]
         run = min(max(math.floor((_NORMAL_RADIUS - radius) * lists.gaussians[i, L22]), 1), SIDE)
@@ -217,7 +217,7 @@ def _place_pairs(radius, blocks, places, lists, begin, end):  # type: ignore[no-
 
 
 @inline
-def _fill(g, mean, cholesky, levels, spacing):  # type: ignore[no-untyped-def]
+def _fill(g, mean, cholesky, levels, spacing):
     """Fill in the columns of a Gaussian."""
     g[MEAN_X], g[MEAN_Y] = mean[0], mean[1]
     g[L11], g[L21], g[L22] = cholesky[0], cholesky[1], cholesky[2]
@@ -233,7 +233,7 @@ def _fill(g, mean, cholesky, levels, spacing):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _coarsen(g, spacing, levels):  # type: ignore[no-untyped-def]
+def _coarsen(g, spacing, levels):
     """Move a Gaussian to its level.
 
     coarse_grids.choose_levels and coarsen in scalars, since numba compiles no torch; test_coarse_grids compares them.
@@ -260,7 +260,7 @@ def _coarsen(g, spacing, levels):  # type: ignore[no-untyped-def]
 
 
 @inline
-def find_block(num_regions, tile_start, regions, tile, region):  # type: ignore[no-untyped-def]
+def find_block(num_regions, tile_start, regions, tile, region):
     """Return the position of a region's block in a tile, or -1; takes arrays, since to pass on a TileTable is slow."""
     if num_regions == 1:
         return tile
@@ -276,19 +276,19 @@ def find_block(num_regions, tile_start, regions, tile, region):  # type: ignore[
 
 
 @inner
-def first_tile(table, level, image, row):  # type: ignore[no-untyped-def]
+def first_tile(table, level, image, row):
     """Return the number of the first tile of a row of tiles."""
     grid = table.grids[level]
     return grid[FIRST_TILE] + (image % table.num_maps * grid[TILE_ROWS] + row) * grid[TILE_COLS]
 
 
 @inner
-def first_head(table, image):  # type: ignore[no-untyped-def]
+def first_head(table, image):
     """Return the place in Lists.start of an image's first block; images that share a map have a copy each."""
     return image * len(table.regions) if table.num_maps == 1 else 0
 
 
 @inner
-def first_node_block(table, image):  # type: ignore[no-untyped-def]
+def first_node_block(table, image):
     """Return the number of an image's first block of nodes; images that share a map have a copy each."""
     return image * (len(table.regions) - len(table.mask_rows) + 1) if table.num_maps == 1 else 0

@@ -27,7 +27,7 @@ from .spline import add_refined, add_sampled, gather_refined, gather_sampled
 
 
 @program.entry
-def sum_rows(lists, backward, image, nodes, slopes, terms, tasks, counters):  # type: ignore[no-untyped-def]
+def sum_rows(lists, backward, image, nodes, slopes, terms, tasks, counters):
     """Add or gather rows of blocks, and sum up the terms of Gaussians.
 
     Args:
@@ -62,7 +62,7 @@ def sum_rows(lists, backward, image, nodes, slopes, terms, tasks, counters):  # 
 
 
 @inner
-def _clear(lists, grid, size, first, end):  # type: ignore[no-untyped-def]
+def _clear(lists, grid, size, first, end):
     """Set blocks of nodes to zero: the live ones, and the last of each copy, which stands for those that are not."""
     copy = len(lists.table.parents) - len(lists.table.mask_rows) + 1
     for block in range(first, end if len(grid) > 0 else first):
@@ -71,7 +71,7 @@ def _clear(lists, grid, size, first, end):  # type: ignore[no-untyped-def]
 
 
 @inline_once
-def _visit_row(lists, task, image, pixels, nodes, slopes, terms, sums, offsets, ones):  # type: ignore[no-untyped-def]
+def _visit_row(lists, task, image, pixels, nodes, slopes, terms, sums, offsets, ones):
     """Visit a row of blocks: add, gather, or both."""
     table, live, start, pairs = lists.table, lists.live, lists.start, lists.pairs
     tile_start, parents, parity = table.tile_start, table.parents, table.parity
@@ -116,7 +116,7 @@ def _make_spline(refine: Any, sample: Any) -> Any:
     """Make the step between a block and its parents, by one function for nodes and another for pixels."""
 
     @inner
-    def visit_spline(coarse, offsets, parity, level, fine, origin, channels, weights, first, step):  # type: ignore[no-untyped-def]
+    def visit_spline(coarse, offsets, parity, level, fine, origin, channels, weights, first, step):
         down, right, across = parity >= 2, parity % 2 == 1, SIDE * channels
         if level > 0:
             refine(coarse, offsets, down, right, fine, origin, across, SIDE, channels, weights, first, step)
@@ -131,7 +131,7 @@ _gather_spline = _make_spline(gather_refined, gather_sampled)
 
 
 @inner
-def _exchange(image, pixels, b, top, left, adds, gathers):  # type: ignore[no-untyped-def]
+def _exchange(image, pixels, b, top, left, adds, gathers):
     """Copy a block to an image (if it adds), from there (if it gathers), or subtract that; outside it is zero."""
     channels, height, width = image.shape[1:]
     rows, cols = min(SIDE, height - top), min(SIDE, width - left)
@@ -147,7 +147,7 @@ def _exchange(image, pixels, b, top, left, adds, gathers):  # type: ignore[no-un
 
 
 @inner
-def _mask(mask_rows, masks, ones, block, level):  # type: ignore[no-untyped-def]
+def _mask(mask_rows, masks, ones, block, level):
     """Return the membership of a block's pixels: array, first element, and step from row to row; step 0: all are 1."""
     if level > 0 or mask_rows[block] < 0:
         return ones, 0, 0
@@ -155,7 +155,7 @@ def _mask(mask_rows, masks, ones, block, level):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _set_offsets(live, parents, block, base, size, offsets):  # type: ignore[no-untyped-def]
+def _set_offsets(live, parents, block, base, size, offsets):
     """Set the offsets of a block's parents, of `size` elements each; return whether one is live."""
     is_live = False
     for k in range(4):

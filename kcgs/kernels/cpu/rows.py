@@ -150,7 +150,7 @@ class _Rows:
 
 
 @intrinsic
-def add_rows(typing_context, pixels, origin, channels, pairs, number, shapes, colors, cutoff, masks, mask_start):  # type: ignore[no-untyped-def]
+def add_rows(typing_context, pixels, origin, channels, pairs, number, shapes, colors, cutoff, masks, mask_start):
     """pixels[row, c, :] += weight[row, :] * colors[c] for the rows of a pair."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -167,7 +167,7 @@ def add_rows(typing_context, pixels, origin, channels, pairs, number, shapes, co
 
 
 @intrinsic
-def gather_rows(  # type: ignore[no-untyped-def]
+def gather_rows(
     typing_context, pixels, origin, channels, pairs, number, shapes, colors, cutoff, masks, mask_start, sums, terms,
     columns,
 ):  # fmt: skip

@@ -132,7 +132,7 @@ def if_else(builder: Any, condition: Any, emit: Callable[[bool], None]) -> None:
 
 
 @intrinsic
-def exchange_rows(  # type: ignore[no-untyped-def]
+def exchange_rows(
     typing_context, image, place, row_stride, channel_stride, pixels, channels, rows, columns, adds, gathers
 ):
     """Copy a block to an image, from element `place` on, if it `adds`; from there if it `gathers`; if both, subtract.

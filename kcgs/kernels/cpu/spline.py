@@ -111,7 +111,7 @@ def _make_loop(emit: Callable[[_Blocks, Any, bool], None]) -> Any:
     """
 
     @intrinsic
-    def loop(  # type: ignore[no-untyped-def]
+    def loop(
         typing_context, coarse, offsets, down, right, fine, origin, row_stride, channel_stride, channels, masks,
         mask_start, mask_stride,
     ):  # fmt: skip

@@ -54,7 +54,7 @@ def error_gradients(plan: CudaPlan, inputs: SplatInputs, target: Tensor) -> Grad
 
 
 @triton_function(warps=1)
-def _gather(  # type: ignore[no-untyped-def]
+def _gather(
     terms, grad, colors, pieces, num_pieces,
     counters, lists, slots, coefficients, weights,
     room, num_cells, num_tiles, rows, cols, cutoff, height, width, channels,
@@ -127,14 +127,14 @@ def _gather(  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _store(address, sums, first, end, columns):  # type: ignore[no-untyped-def]
+def _store(address, sums, first, end, columns):
     """Add up the parts of each pair."""
     pair = first + tl.arange(0, PIECE)
     tl.store(address + pair.to(tl.int64) * columns, tl.sum(tl.reshape(sums, [_PARTS, PIECE]), axis=0), mask=pair < end)
 
 
 @triton_function(warps=2)
-def _reduce(  # type: ignore[no-untyped-def]
+def _reduce(
     terms, cholesky, counters, gaussians, slots, means_grad, cholesky_grad, colors_grad, total, room, channels,
     GEOMETRY: tl.constexpr, BLOCK: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
@@ -176,5 +176,5 @@ def _reduce(  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _at(values, places, place):  # type: ignore[no-untyped-def]
+def _at(values, places, place):
     return tl.sum(tl.where(places == place, values, 0.0), axis=0)

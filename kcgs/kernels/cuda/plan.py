@@ -122,7 +122,7 @@ def plan(inputs: SplatInputs) -> CudaPlan | None:
 
 
 @triton_function(warps=4)
-def _prepare(  # type: ignore[no-untyped-def]
+def _prepare(
     means, cholesky, colors, region_ids, ids, counters, gaussians, notes,
     total, num_ids, steps, height, width, channels, radius,
     MAPPED: tl.constexpr, NOTES: tl.constexpr, BLOCK: tl.constexpr,
@@ -178,26 +178,26 @@ def _prepare(  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _tile_of(pixel, touches, length):  # type: ignore[no-untyped-def]
+def _tile_of(pixel, touches, length):
     inside = tl.minimum(tl.maximum(tl.where(touches, pixel, 0.0), 0.0), (length - 1).to(tl.float64))
     return inside.to(tl.int32) // SIDE
 
 
 @triton.jit
-def fails(counters, room):  # type: ignore[no-untyped-def]
+def fails(counters, room):
     """Whether lists do not fit, or values are not valid: nothing is listed then, and the image is NaN."""
     return (tl.load(counters + SLOTS) > room) | (tl.load(counters + INVALID) > 0)
 
 
 @triton.jit
-def _box(gaussians, g, total, mask):  # type: ignore[no-untyped-def]
+def _box(gaussians, g, total, mask):
     first = tl.load(gaussians + g, mask=mask, other=1 << 16)
     last = tl.load(gaussians + total + g, mask=mask, other=0)
     return first & 0xFFFF, first >> 16, last & 0xFFFF, last >> 16
 
 
 @triton_function(warps=8)
-def _bin(  # type: ignore[no-untyped-def]
+def _bin(
     gaussians, counters, lists, slots, notes, total, count, room, num_lists, cell_rows, cell_cols,
     NOTES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -233,13 +233,13 @@ def _bin(  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _overlaps(x0, y0, x1, y1, left, top):  # type: ignore[no-untyped-def]
+def _overlaps(x0, y0, x1, y1, left, top):
     touches = (x0 < left + _CELL) & (x1 >= left) & (y0 < top + _CELL) & (y1 >= top)
     return touches & (y0 <= y1)
 
 
 @triton_function(warps=4)
-def _tile(  # type: ignore[no-untyped-def]
+def _tile(
     means, cholesky, counters, gaussians, lists, slots, coefficients, pieces, starts, regions, planes,
     map_tiles, total, room, num_cells, num_tiles, rows, cols, cell_rows, cell_cols, num_pieces, radius,
     MAPPED: tl.constexpr, BLOCK: tl.constexpr,
@@ -313,6 +313,6 @@ def _tile(  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _store(address, coefficient, mask):  # type: ignore[no-untyped-def]
+def _store(address, coefficient, mask):
     scaled = tl.minimum(tl.maximum(coefficient, -_Z_LIMIT), _Z_LIMIT) * SCALE
     tl.store(address, scaled.to(tl.float32), mask=mask)

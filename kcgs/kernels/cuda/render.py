@@ -51,7 +51,7 @@ def channels_at_once(channels: int) -> int:
 
 
 @triton.jit
-def weigh(k0, k1, k2, k3, k4, x, y, cutoff):  # type: ignore[no-untyped-def]
+def weigh(k0, k1, k2, k3, k4, x, y, cutoff):
     """Evaluate whitened coordinates times SCALE, and the weight."""
     z1 = k0 + k1 * x
     z2 = k2 + k4 * y + k3 * x
@@ -60,7 +60,7 @@ def weigh(k0, k1, k2, k3, k4, x, y, cutoff):  # type: ignore[no-untyped-def]
 
 
 @triton_function(warps=2)
-def _render(  # type: ignore[no-untyped-def]
+def _render(
     image, target, colors, counters, lists, slots, coefficients, weights,
     room, num_cells, num_tiles, rows, cols, cutoff, height, width, channels,
     BLOCK: tl.constexpr, MAPPED: tl.constexpr, MINUS: tl.constexpr,
