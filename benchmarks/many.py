@@ -27,7 +27,7 @@ from .core.run import Job, Options, Page, Row
 COUNTS = (10_000, 30_000, 50_000, 70_000)
 QUICK_COUNTS = (100, 200)
 # images of four photos of Kodak
-LARGE = tuple(f"2 x 2 photos, {k + 1}" for k in range(8))
+LARGE = tuple(f"2 x 2 photos {k + 1}" for k in range(8))
 # all photos of Kodak in one image
 HUGE, HUGE_COUNT = "4 x 6 photos", 300_000
 CPU, GPU = "CPU", "GPU"

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 _PIXELS = 1 << 14  # of a slice: fits into a cache, and is too small for threads of torch, whose start would cost more
 
 
-def row_slices(height: int, width: int) -> Iterator[slice]:
+def row_slices(height: int, width: int, pixels: int = _PIXELS) -> Iterator[slice]:
     """Divide the rows of an image into slices of few pixels, at least one row each."""
-    step = max(1, _PIXELS // max(1, width))
+    step = max(1, pixels // max(1, width))
     for top in range(0, height, step):
         yield slice(top, min(top + step, height))

@@ -13,6 +13,7 @@ from kcgs._check import check_floating
 from kcgs._labels import check_labels
 from kcgs._rows import row_slices
 
+_PIXELS = 1 << 18  # of a slice of a map whose pairs are listed, which bounds the memory of maps of noise
 _TABLE_IDS = 1 << 16  # up to this id a table is ten times faster than sorting every pixel
 
 
@@ -130,7 +131,7 @@ def touching_pairs(labels: Tensor) -> set[tuple[int, int]]:
     if labels.ndim == 3:
         return set().union(*map(touching_pairs, labels))
     pairs: set[tuple[int, int]] = set()
-    for rows in row_slices(*labels.shape):
+    for rows in row_slices(*labels.shape, pixels=_PIXELS):
         edges = contour_edges(labels[rows.start : rows.stop + 1])[0]  # with the row below
         pairs |= {(low, high) for low, high in unique_pairs(edges)[0].tolist()}
     return pairs

@@ -138,7 +138,7 @@ def softness_of_labels(softness: OneSoftness | Mapping[tuple[int, int], float], 
     """Return the softness without the pairs of regions that labels do not have."""
     if not isinstance(softness, Mapping):
         return softness
-    ids = set(labels.unique().tolist())
+    ids = set(labels.unique_consecutive().unique().tolist())  # sorting all pixels takes ten times as long
     return {pair: value for pair, value in softness.items() if ids.issuperset(pair)}
 
 

@@ -98,7 +98,7 @@ def method_options(method: str) -> dict[str, Any]:
 
     Example:
         >>> method_options("auto")
-        {'snap': 0, 'min_size': None, 'connected': True, 'max_regions': 30}
+        {'objects': None, 'snap': 0, 'min_size': None, 'connected': True, 'max_regions': 30}
     """
     if method not in _methods:
         raise InvalidArgument("method", f"one of {', '.join(available_methods())}", repr(method))
