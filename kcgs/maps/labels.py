@@ -131,7 +131,7 @@ def touching_pairs(labels: Tensor) -> set[tuple[int, int]]:
     if labels.ndim == 3:
         return set().union(*map(touching_pairs, labels))
     pairs: set[tuple[int, int]] = set()
-    for rows in row_slices(*labels.shape, pixels=_PIXELS):
+    for rows in row_slices(labels.shape[0], labels.shape[1], _PIXELS):
         edges = contour_edges(labels[rows.start : rows.stop + 1])[0]  # with the row below
         pairs |= {(low, high) for low, high in unique_pairs(edges)[0].tolist()}
     return pairs
