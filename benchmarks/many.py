@@ -7,7 +7,6 @@ import time
 from functools import cache
 from pathlib import Path
 from statistics import fmean
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -33,19 +32,21 @@ HUGE, HUGE_COUNT = "4 x 6 photos", 300_000
 CPU, GPU = "CPU", "GPU"
 # of Kodak on a GPU: N, dB and seconds
 GOAL = (50_000, 48.5, 2.0)
-# N, dB and seconds on Kodak as printed, on GPUs
-PRINTED = {
-    "GaussianImage++": (10_000, 35.41, None), "Structure-Guided": (30_000, 40.51, 132.0),
-    "Fast-2DGS": (50_000, 43.13, 10.0), "SAD, sites of a soft Voronoi diagram": (50_000, 46.0, 2.2),
-    "Structure-Guided, 70,000": (70_000, 45.40, None),
-}  # fmt: skip
+# name, N, dB and seconds on Kodak as printed, on GPUs
+PRINTED: tuple[tuple[str, int, float, float | None], ...] = (
+    ("GaussianImage++", 10_000, 35.41, None),
+    ("Structure-Guided", 30_000, 40.51, 132.0),
+    ("Structure-Guided", 70_000, 45.40, None),
+    ("Fast-2DGS", 50_000, 43.13, 10.0),
+    ("SAD, sites of a soft Voronoi diagram", 50_000, 46.0, 2.2),
+)
 METHOD = f"""`fit(image, None, N)` with its default settings, without compilation: the 24 photos of Kodak; images of
 four of them side by side, {len(LARGE)} of them; and one of all 24, 9.4 megapixels, with {HUGE_COUNT:,} Gaussians.
 Seconds are those of the call, on all cores of a CPU or on a GPU. MB is what a fit of the largest image adds at the
 peak. As printed, on GPUs: {
     "; ".join(
         f"{name} {psnr:g} dB at N = {n:,}" + (f" in {seconds:g} s" if seconds else "")
-        for name, (n, psnr, seconds) in PRINTED.items()
+        for name, n, psnr, seconds in PRINTED
     )
 }."""
 
@@ -81,11 +82,11 @@ def measure(image: str, method: str, counts: list[int], data: str, quick: bool) 
                 }
             )  # fmt: skip
     if image == HUGE:
-        action: Any = (fit_by_name, image, data, quick, method, config, max(counts))
+        largest = data, quick, method, config, max(counts)
         rows[-1]["peak_MB"] = (
-            megabytes(lambda: action[0](*action[1:]))
+            megabytes(lambda: fit_by_name(image, *largest))
             if method == GPU
-            else peak_megabytes(*action, warm_up=("kodim01", data, quick, method, config, 100))
+            else peak_megabytes(fit_by_name, image, *largest, warm_up=("kodim01", *largest[:-1], 100))
         )
     return rows
 

@@ -61,7 +61,7 @@ def edit(
     from kcgs import editing, load, video
 
     edited = load(scene)
-    hole: dict[str, Any] = {"fill": not no_fill} | ({} if margin is None else {"margin": margin})
+    hole: dict[str, Any] = {"fill": not no_fill} | _set_options(margin=margin)
     delete_region: Any = partial(editing.delete_region, **hole)
     move_region: Any = partial(editing.move_region, **hole)
     if edited.field.means.ndim == 3:
@@ -71,12 +71,18 @@ def edit(
     if delete:
         edited = _apply("delete", delete_region, edited, delete)
     for region, color in colors:
-        share = {} if strength is None else {"strength": strength}
-        edited = _apply("recolor", editing.recolor_region, edited, region, color=color, **share)
+        edited = _apply(
+            "recolor", editing.recolor_region, edited, region, color=color, **_set_options(strength=strength)
+        )
     for region, offset in offsets:
         edited = _apply("move", move_region, edited, region, offset)
     size = edited.save(output)
     print_report({**describe_scene(edited), **describe_file(output, size, edited.size)}, as_json, str(output))
+
+
+def _set_options(**options: object) -> dict[str, Any]:
+    """Return the options that have a value; the others keep the default of the function."""
+    return {name: value for name, value in options.items() if value is not None}
 
 
 def _parse(option: str, expected: str, text: str) -> tuple[int, str]:

@@ -49,7 +49,7 @@ _RATE = 0.07
 _COLOR_RATE = 0.015
 
 
-def fill_hole(scene: Scene, hole: Tensor, visible: Tensor, margin: int = MARGIN) -> Scene:
+def fill_hole(scene: Scene, hole: Tensor, visible: Tensor, margin: int) -> Scene:
     """Fill a hole from its surroundings.
 
     Args:

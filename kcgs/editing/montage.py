@@ -16,9 +16,9 @@ _LIMIT = 1e4
 def choose_layers(layers: Tensor, costs: Tensor, unknown: Tensor) -> Tensor:
     """Choose a layer for each unknown pixel, so that seams between layers and at the border of the hole are seen least.
 
-    The cost of two neighbours with different layers is the difference of these layers at both pixels; the cost of a
-    pixel beside a known one is the difference of its layer and the image there. Each step
-    gives one layer to the pixels where this lowers the sum most: first each layer, then again those in use.
+    Two neighbours with different layers cost the difference of these layers at both pixels. A pixel beside a known one
+    costs the difference of its layer and the image at the known pixel. Each step gives one layer to the pixels where
+    this lowers the sum most: first each layer in turn, then those in use again.
 
     Source: Boykov, Veksler and Zabih, "Fast approximate energy minimization via graph cuts", 2001, for the steps;
     Agarwala et al., "Interactive digital photomontage", 2004, for seams.

@@ -1,6 +1,6 @@
 """An image in, a scene out."""
 
-from .checks import check_image_and_regions, default_num_gaussians
+from .checks import check_image_and_regions, check_num_gaussians, default_num_gaussians
 from .config import FitConfig, available_recipes
 from .contour_moves import move_contours
 from .initial import initial_field

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from kcgs._check import check_count
 from kcgs._objectives import objective_for
 from kcgs._progress import Progress
 from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
-from kcgs.fitting import FitConfig, check_image_and_regions, default_num_gaussians, fit
+from kcgs.fitting import FitConfig, check_image_and_regions, check_num_gaussians, fit
 from kcgs.functional import RegionMap, lookup_regions
 from kcgs.nn import pad_rows
 from kcgs.optim import Gaussians
@@ -100,7 +99,7 @@ def fit_video(
     """
     config = FitConfig.from_recipe(recipe, **({"merge_regions": False} | settings))
     config = config.model_copy(update={"objective": objective_for("video", config.objective)})
-    video = _VideoFit(config, None if num_gaussians is None else check_count("num_gaussians", num_gaussians), seed)
+    video = _VideoFit(config, num_gaussians, seed)
     length = len(frames) if isinstance(frames, Sized) else None
     with Progress("fit-video", pulse=length is None, visible=progress) as bar:
         for number, (frame, labels) in enumerate(_pair(frames, label_maps if config.guidance else None)):
@@ -149,10 +148,10 @@ class _VideoFit:
         config = self.config
         if self.frames:  # contours have the softness of the first frame
             config = config.model_copy(update={"softness": 0.0})
-        self.num_gaussians = self.num_gaussians or default_num_gaussians(*self.image.shape[1:])
-        scene = fit(self.image, regions, self.num_gaussians, recipe=config, seed=self.seed).scene
+        count = check_num_gaussians(self.num_gaussians, self.image)
+        scene = fit(self.image, regions, count, recipe=config, seed=self.seed).scene
         regions = scene.regions or regions  # a fit removes a map of one region
-        return Scene(pad_rows(scene.field, self.num_gaussians, regions), regions)
+        return Scene(pad_rows(scene.field, count, regions), regions)
 
     def _follow(self, flow: Tensor, regions: RegionMap | None) -> tuple[Scene, Tensor]:
         """Return a frame, fitted from the one before, and the mask of the pixels that changed."""
