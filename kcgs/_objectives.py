@@ -7,12 +7,12 @@ from typing import Literal, get_args
 from .errors import InvalidArgument
 
 ObjectiveName = Literal["l2", "l1", "ms-ssim", "l1+ssim"]
-Purpose = Literal["fit", "file", "file of a PSNR", "video"]
+Purpose = Literal["fit", "file of a size", "file of a PSNR", "video"]
 NAMES: tuple[ObjectiveName, ...] = get_args(ObjectiveName)
 # the objectives of each purpose; the first is its default
 PURPOSES: dict[Purpose, tuple[ObjectiveName, ...]] = {
     "fit": NAMES,
-    "file": ("ms-ssim", "l2"),
+    "file of a size": ("ms-ssim", "l2"),
     "file of a PSNR": ("l2", "ms-ssim"),
     "video": ("l2", "ms-ssim"),
 }

@@ -137,9 +137,9 @@ class Scene(nn.Module):
     def __iter__(self) -> Iterator[Scene]:
         return (self[k] for k in range(len(self)))
 
-    def save(self, path: str | os.PathLike[str]) -> int:
-        """Write the scene, as :func:`kcgs.save` does; return the bytes of the file."""
-        return kcgs.save(path, self)
+    def save(self, path: str | os.PathLike[str], **options: Any) -> int:
+        """Write the scene, with the keywords of :func:`kcgs.save`; return the bytes of the file."""
+        return kcgs.save(path, self, **options)
 
     def to_onnx(self, path: str | os.PathLike[str], **options: Any) -> onnx.ModelProto:
         """Write the ONNX graph that renders the scene at any size, as Kornia's modules do, and return it.

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from pathlib import Path
 from typing import NamedTuple
 
 from kcgs._repr import brief
 
-__all__ = ["Entry", "entries", "find"]
+__all__ = ["Entry", "entries", "find", "locate"]
 
 _PACKAGE = Path(__file__).resolve().parent
 # within the package in a wheel, beside it in a checkout
@@ -56,3 +57,8 @@ def find(name: str, folder: Path | None = None) -> Path:
     if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != entry.sha256:
         raise ValueError(f"{path} must be the file that the manifest names; it is missing or was changed")
     return path
+
+
+def locate(path: str | os.PathLike[str]) -> Path:
+    """Return the path of a scene: "zoo:NAME" is one of the zoo, anything else is a path as it is."""
+    return find(str(path)) if str(path).startswith(_PREFIX) else Path(path)

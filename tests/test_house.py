@@ -20,10 +20,10 @@ ROOT = PACKAGE.parent
 LAYERS = [
     {"__main__"},
     {"cli"},
-    {"zoo"},
     {"page"},
-    {"rate", "video"},
-    {"editing", "files"},
+    {"files", "video"},
+    {"rate"},
+    {"editing", "zoo"},
     {"fitting", "codec", "onnx", "segment"},
     {"data", "evaluation", "pruning"},
     {"storage"},

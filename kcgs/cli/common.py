@@ -29,14 +29,12 @@ _UNDEFINED = {
 
 
 def _scene_path(text: str, other_suffixes: tuple[str, ...] = ()) -> Path:
-    if text.startswith("zoo:"):
-        from kcgs.zoo import find
+    from kcgs.zoo import locate
 
-        try:
-            return find(text)
-        except ValueError as error:
-            raise typer.BadParameter(str(error)) from error
-    path = Path(text)
+    try:
+        path = locate(text)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from error
     if path.suffix not in SCENES and path.suffix.lower() not in other_suffixes:
         suffixes = " or ".join((*SCENES, *other_suffixes))
         raise typer.BadParameter(f"must end in {suffixes}, or be zoo:NAME; got {text!r}")

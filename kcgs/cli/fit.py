@@ -122,7 +122,10 @@ def fit_and_save(
 def config_for(output: Path, request: options.FitRequest) -> FitConfig:
     """Return the settings of a fit whose scene goes to a file: a compressed one loses some of a target."""
     config = request.load_config()
-    if config.target_psnr is None or output.suffix != ".kcgs" or request.target_bytes is not None:
+    if output.suffix != ".kcgs" or request.target_bytes is not None:
+        return config
+    objective_for("file of a PSNR", config.objective)  # refuses what the file cannot lower, before the fit
+    if config.target_psnr is None:
         return config
     return config.model_copy(update={"target_psnr": config.target_psnr + _ROUNDING_MARGIN})
 
@@ -131,21 +134,17 @@ def save_result(
     output: Path, image: Tensor, result: FitResult, request: options.FitRequest, *, progress: bool = False
 ) -> tuple[Scene, int]:
     """Write the scene of a fit of one image, by the suffix of `output`; return it as a reader has it, and the bytes."""
-    from kcgs.rate import compress, quality_for
-    from kcgs.scene import Scene
+    from kcgs import Scene, load
 
-    if output.suffix != ".kcgs":
-        scene = Scene(result.scene.field, result.scene.regions, {"recipe": request.recipe}).to("cpu")
-        return scene, scene.save(output)
-    config = request.load_config()
-    # the file lowers what the fit does
-    objective = objective_for("file", objective_for("fit", config.objective))
-    target_psnr = config.target_psnr
-    quality = quality_for(float(result.psnr)) if target_psnr is None else None
-    goal: Any = {"quality": quality, "target_psnr": target_psnr, "objective": objective}
-    with Progress("writing the file", pulse=True, visible=progress):
-        compressed = compress(result.scene, image, seed=request.seed, **goal)
-    return compressed.scene, write_file(output, compressed.data)
+    scene, config = Scene(result.scene.field, result.scene.regions, {"recipe": request.recipe}), request.load_config()
+    is_rounded = output.suffix == ".kcgs"
+    rounding: dict[str, Any] = {}
+    if is_rounded:
+        rounding = {"image": image, "seed": request.seed}
+        rounding |= {"target_psnr": config.target_psnr, "objective": config.objective}
+    with Progress("writing the file", pulse=True, visible=progress and is_rounded):
+        num_bytes = scene.save(output, **rounding)
+    return load(output), num_bytes
 
 
 def read_regions(

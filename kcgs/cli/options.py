@@ -25,13 +25,14 @@ Threshold = Annotated[
     float | None,
     typer.Option(min=0, help="Of a mask with soft edges: grey level above which a pixel is of the object."),
 ]
+_FILES = PURPOSES["file of a size"]
 Objective = Annotated[
     str | None,
     typer.Option(
         metavar="|".join(PURPOSES["fit"]),
         callback=check_objective,
-        help=f"What to lower: the squared or the absolute error, or what MS-SSIM lacks. Default: {PURPOSES['fit'][0]}; "
-        f"with --target-bytes and for kcgs encode {PURPOSES['file'][0]}. Files take {' or '.join(PURPOSES['file'])}.",
+        help="What to lower: the squared or the absolute error, or what MS-SSIM lacks. "
+        f"Default: {PURPOSES['fit'][0]}; with --target-bytes {_FILES[0]}. Files take {' or '.join(_FILES)}.",
     ),
 ]
 

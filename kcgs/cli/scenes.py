@@ -148,7 +148,10 @@ def encode(
     target_bytes: Annotated[int | None, typer.Option(min=1, help="The finest file that is not larger.")] = None,
     quality: Annotated[
         float | None,
-        typer.Option(help="PSNR in dB of the file's render against the scene's; 46 where neither is given."),
+        typer.Option(
+            help="PSNR in dB of the file's render against the scene's. Default: 46; with --image so much that the file "
+            "is nearly as good as the scene."
+        ),
     ] = None,
     image: Annotated[
         Path | None,
@@ -175,24 +178,18 @@ def encode(
     exclude("a scene", threshold=threshold)
     if image is None:
         exclude("a scene without --image", objective=objective)
-    from kcgs import codec, load
-    from kcgs.data import load_image
+    from kcgs import load
     from kcgs.functional import psnr
-    from kcgs.rate import compress
 
     loaded = load(scene)
     goal: dict[str, Any] = {"quality": quality, "target_bytes": target_bytes}
     with Progress("writing the file", pulse=True, visible=not quiet):
-        if image is None:
-            data = codec.encode(loaded, **goal)
-        else:
-            data = compress(loaded, load_image(image), **goal, objective=objective).data
-    write_file(output, data)
-    rounded = codec.decode(data).scene
+        num_bytes = loaded.save(output, image=image, **goal, objective=objective)
+    rounded = load(output)
     report = {
         "psnr_to_scene": float(psnr(rounded.render(), loaded.render())),
         **describe_scene(rounded),
-        **describe_file(output, len(data), loaded.size),
+        **describe_file(output, num_bytes, loaded.size),
     }
     print_report(report, as_json, str(output))
 

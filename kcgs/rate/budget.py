@@ -191,7 +191,7 @@ def fit_bytes(
     if config.target_psnr is not None:
         raise InvalidArgument("target_psnr", "None with target_bytes", config.target_psnr)
     check_count("target_bytes", target_bytes, _MIN_BYTES)
-    problem = make_problem(image, regions, 1, config, seed, purpose="file")
+    problem = make_problem(image, regions, 1, config, seed, purpose="file of a size")
     with Progress("trial fits", pulse=True, visible=progress), threads_for_kernels(problem.canvas[0, 0].numel()):
         choice = _choose_regions(problem, target_bytes)
     reduced = _reduce(problem, choice)

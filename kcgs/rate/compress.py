@@ -61,14 +61,15 @@ def compress(
     Args:
         scene: N Gaussians of one image; opacities are merged into the colours, and metadata are not stored.
         image: what :func:`kcgs.fit` takes, of the scene's size and channels.
-        quality: as in :func:`kcgs.codec.encode`; the error is lower, for Gaussians correct each other.
+        quality: as in :func:`kcgs.codec.encode`; the error is lower, for Gaussians correct each other. None, with no
+            target: that of :func:`quality_for`, so that the file is nearly as good as the scene.
         target_bytes: write the finest file of at most `target_bytes`, in place of `quality`.
         target_psnr: dB against the image, in place of both: the coarsest of a few qualities that reaches it, or where
             the scene itself does not, a file that is nearly as good as the scene.
         iterations: renders that descent and rounding may take, at least 1.
         seed: of the order in which Gaussians are rounded.
-        objective: of the descent, l2 or ms-ssim, as in :class:`kcgs.FitConfig`. None: l2 with `target_psnr`, else
-            ms-ssim.
+        objective: of the descent, l2 or ms-ssim, as in :class:`kcgs.FitConfig`. None: ms-ssim with `target_bytes`,
+            else l2.
 
     Returns:
         The file, and the scene that it decodes to.
@@ -96,15 +97,19 @@ def compress(
             raise InvalidArgument("target_psnr", "None with quality or target_bytes", target_psnr)
     qp = writer.qp_for(quality, target_bytes)
     check_count("iterations", iterations)
-    name = objective_for("file" if target_psnr is None else "file of a PSNR", check_objective(objective))
+    name = objective_for("file of a PSNR" if target_bytes is None else "file of a size", check_objective(objective))
     compressor = Compressor(writer, OBJECTIVES[name](target), iterations, seed)
     with threads_for_kernels(target[0].numel()):
         if target_bytes is not None:
             data = compressor.search_bytes(target_bytes)
-        elif target_psnr is not None:
-            data = compressor.search_psnr(target_psnr, float(psnr(scene.render().to(target), target)))
-        else:
+        elif quality is not None:
             data = compressor.write(qp)
+        else:
+            scene_psnr = float(psnr(scene.render().to(target), target))
+            if target_psnr is None:
+                data = compressor.write(writer.qp_for(quality_for(scene_psnr)))
+            else:
+                data = compressor.search_psnr(target_psnr, scene_psnr)
     return Compressed(data, decode(data).scene)
 
 

@@ -78,11 +78,11 @@ class TestCompress:
         ("changes", "match"),
         [
             ({"image": torch.zeros(3, 50, 160)}, "image must have shape"),
-            ({"objective": "l1"}, "objective must be ms-ssim or l2 for a file; got 'l1'"),
             (
-                {"objective": "l1", "target_psnr": 30.0},
-                "objective must be l2 or ms-ssim for a file of a PSNR; got 'l1'",
+                {"objective": "l1", "target_bytes": 900},
+                "objective must be ms-ssim or l2 for a file of a size; got 'l1'",
             ),
+            ({"objective": "l1"}, "objective must be l2 or ms-ssim for a file of a PSNR; got 'l1'"),
             ({"objective": "psnr"}, "objective must be one of .*; got 'psnr', which is now 'l2'"),
             ({"iterations": 0}, "iterations must be at least 1; got 0"),
             ({"quality": 40, "target_bytes": 900}, "quality must be None with target_bytes; got 40"),
