@@ -37,7 +37,10 @@ def fit_command(
     image: ImageFile,
     *,
     regions: Annotated[
-        str, typer.Option(metavar="MASK|auto|none", help="Label-map file, or auto (segment the image), or none.")
+        str,
+        typer.Option(
+            metavar="MASK|auto|none", help=f"Label-map file, or auto (segment the image, {options.IF_LARGE}), or none."
+        ),
     ] = "auto",
     request: options.FitRequest,
     output: Annotated[
@@ -58,9 +61,7 @@ def fit_command(
     output = output or Path(f"{image.stem}{request.default_suffix}")
     check_output(output, *(SCENES if request.target_bytes is None else (".kcgs",)))
     check_new(output, overwrite)
-    from kcgs.data import load_image
-
-    target = load_image(image)
+    target = request.load_image(image)
     labels = read_regions(regions, target, threshold, resize=resize_regions, progress=not quiet)
     with InterruptHandler() as interrupts:
         saved_fit = fit_and_save(output, target, labels, request, on_step=interrupts.on_step, progress=not quiet)
@@ -74,6 +75,8 @@ def fit_command(
     if regions_report is not None and not as_json:
         is_lost = regions_report.num_after == 1 < regions_report.num_before and regions_report.dropped != "recipe"
         typer.echo(f"regions: {regions_report}{'. --keep-contours keeps them' if is_lost else ''}")
+    if labels is None and regions == "auto" and not as_json:
+        typer.echo(f"regions: none, for a side is below {options.LEAST_SIDE} pixels")
     if interrupts.count:
         raise exit_interrupted(f"the best so far to {output}")
     if report["target_reached"] is False:
@@ -150,12 +153,14 @@ def save_result(
 def read_regions(
     regions: str, image: Tensor, threshold: float | None = None, *, resize: bool = False, progress: bool = False
 ) -> Tensor | None:
-    """Return the label map that the option --regions names, with `resize` at the size of the image."""
+    """Return the label map that the option --regions names, with `resize` at the size of the image; None: none."""
     if regions in ("auto", "none"):
         options.exclude(f"--regions {regions}", threshold=threshold)
     if regions == "none":
         return None
     if regions == "auto":
+        if min(image.shape[-2:]) < options.LEAST_SIDE:
+            return None
         from kcgs.segment import segment
 
         with Progress("finding regions", pulse=True, visible=progress):

@@ -38,7 +38,11 @@ def fit_many_command(
     *,
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the scenes or files, and results.csv.")],
     regions: Annotated[
-        str, typer.Option(metavar="DIR|auto|none", help="Folder of masks with the images' stems, or auto, or none.")
+        str,
+        typer.Option(
+            metavar="DIR|auto|none",
+            help=f"Folder of masks with the images' stems, or auto (segment each image, {options.IF_LARGE}), or none.",
+        ),
     ] = "auto",
     request: options.FitRequest,
     suffix: Annotated[

@@ -80,12 +80,10 @@ class FileBatch(NamedTuple):
 
 def load_job(job: FitJob) -> Loaded:
     """Read the image of a job and its regions."""
-    from kcgs.data import load_image
-
     # a warning of one image among many must say which image: the caller does
     with warnings.catch_warnings(record=True) as messages:
         warnings.simplefilter("always", UserWarning)
-        image = load_image(job.image)
+        image = job.request.load_image(job.image)
         labels = read_regions(job.regions, image, job.threshold, resize=job.resize_regions)
     return Loaded(image, labels, tuple(str(message.message) for message in messages))
 
@@ -234,4 +232,5 @@ def describe_settings(job: FitJob) -> str:
     settings: tuple[Any, ...] = (
         request.load_config().model_dump_json(), request.num_gaussians, request.target_bytes, request.seed,
     )  # fmt: skip
+    settings += ("grey",) if request.is_grey else ()
     return repr(settings if job.threshold is None else (*settings, job.threshold))

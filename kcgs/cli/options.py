@@ -12,7 +12,10 @@ from kcgs._objectives import PURPOSES, check_objective
 from kcgs.errors import InvalidArgument
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import torch
+    from torch import Tensor
 
     from kcgs.fitting import FitConfig
     from kcgs.scene import Scene
@@ -25,6 +28,9 @@ Threshold = Annotated[
     float | None,
     typer.Option(min=0, help="Of a mask with soft edges: grey level above which a pixel is of the object."),
 ]
+# pixels of the shorter side of an image that --regions auto segments: in smaller ones regions seldom pay
+LEAST_SIDE = 64
+IF_LARGE = f"if no side is below {LEAST_SIDE} pixels"
 _FILES = PURPOSES["file of a size"]
 Objective = Annotated[
     str | None,
@@ -50,6 +56,8 @@ class FitRequest(NamedTuple):
     seed: int
     device: str
     """Where it is fitted."""
+    is_grey: bool = False
+    """Fit the luma alone, one channel."""
 
     @property
     def default_suffix(self) -> str:
@@ -67,6 +75,12 @@ class FitRequest(NamedTuple):
         from kcgs.fitting import FitConfig
 
         return FitConfig.from_recipe(self.recipe, **self.settings)
+
+    def load_image(self, path: Path) -> Tensor:
+        """Read an image with the channels that are fitted."""
+        from kcgs.data import load_image
+
+        return load_image(path, channels="L" if self.is_grey else "RGB")
 
     def load_device(self) -> torch.device:
         """Return the device; a ValueError says that torch has none of that name."""
@@ -106,6 +120,11 @@ def fit_request(
         float | None,
         typer.Option(help="Least standard deviation of a Gaussian in pixels: more is softer, and has no stray lines."),
     ] = None,
+    bounded: Annotated[
+        bool,
+        typer.Option("--bounded", help="Centres within the image, factors below its side, colours in [-1, 2]."),
+    ] = False,
+    grey: Annotated[bool, typer.Option("--grey", help="Fit one channel, the luma, in place of three.")] = False,
     seed: Annotated[int, typer.Option(help="Seed of the random start.")] = 0,
     device: Annotated[str, typer.Option(help="Where to fit: cpu, or cuda for a GPU.")] = "cpu",
 ) -> FitRequest:
@@ -114,12 +133,12 @@ def fit_request(
         exclude("--target-bytes", num_gaussians=num_gaussians, target_psnr=target_psnr)
     settings: dict[str, Any] = {
         "iterations": iterations, "objective": objective, "max_seconds": max_seconds, "target_psnr": target_psnr,
-        "min_sigma": min_sigma,
+        "min_sigma": min_sigma, "bounded": bounded or None,
     }  # fmt: skip
     settings = {key: value for key, value in settings.items() if value is not None}
     if keep_contours:
         settings |= {"move_contours": False, "merge_regions": False}
-    return FitRequest(num_gaussians, target_bytes, recipe, settings, seed, device)
+    return FitRequest(num_gaussians, target_bytes, recipe, settings, seed, device, grey)
 
 
 def with_fit_options(command: Callable[..., None], *, without: tuple[str, ...] = ()) -> Callable[..., None]:

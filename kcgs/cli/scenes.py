@@ -90,10 +90,10 @@ def eval_command(
 ) -> None:
     """Compare a scene with an image; the seconds are those of a render."""
     from kcgs import evaluate, load
-    from kcgs.data import load_image
     from kcgs.scene import check_unbatched
 
-    loaded, target = check_unbatched(load(scene)), load_image(image)
+    loaded = check_unbatched(load(scene))
+    target = _load_like(loaded, image)
     labels = read_regions("none" if regions is None else str(regions), target, threshold, resize=resize_regions)
     with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # the table says it
         report: dict[str, Any] = evaluate(loaded, target, labels)
@@ -182,9 +182,10 @@ def encode(
     from kcgs.functional import psnr
 
     loaded = load(scene)
+    target = None if image is None else _load_like(loaded, image)
     goal: dict[str, Any] = {"quality": quality, "target_bytes": target_bytes}
     with Progress("writing the file", pulse=True, visible=not quiet):
-        num_bytes = loaded.save(output, image=image, **goal, objective=objective)
+        num_bytes = loaded.save(output, image=target, **goal, objective=objective)
     rounded = load(output)
     report = {
         "psnr_to_scene": float(psnr(rounded.render(), loaded.render())),
@@ -221,6 +222,13 @@ def decode(
         typer.echo(f"warning: {file} ends after {layers} of {num_layers} layers: the image is coarser", err=True)
     save_image(output, scene.render(target_size(scene, None, None)))
     print_report(_describe_image(output, scene.size), as_json, str(output))
+
+
+def _load_like(scene: Scene, image: Path) -> Tensor:
+    """Read an image with one channel for a scene with one."""
+    from kcgs.data import load_image
+
+    return load_image(image, channels="L" if scene.field.colors.shape[-1] == 1 else "RGB")
 
 
 def _read_map(file: Path) -> Tensor | None:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from kcgs.scene import Scene
 
 # options of a fit that only make sense for one image
-_SINGLE_IMAGE_OPTIONS = ("max_seconds", "target_psnr", "target_bytes", "device")
+_SINGLE_IMAGE_OPTIONS = ("max_seconds", "target_psnr", "target_bytes", "device", "bounded", "grey")
 
 
 @app.command("fit-video")
@@ -43,7 +43,7 @@ def fit_video_command(
         typer.Option(
             metavar="MASKS|auto|none",
             help="Folder of label maps, one for each frame; or a label map of the first frame, or auto (segment the "
-            "first frame), which follow the motion; or none.",
+            f"first frame, {options.IF_LARGE}), which follow the motion; or none.",
         ),
     ] = "auto",
     threshold: options.Threshold = None,

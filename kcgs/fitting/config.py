@@ -95,6 +95,11 @@ class FitConfig(BaseModel):
     min_sigma: float = Field(
         0.5, ge=0.0, description="least standard deviation of a Gaussian in pixels, for the optimizer gaussian-adam"
     )
+    bounded: bool = Field(
+        False,
+        description="keep centres within the image, factors below its longer side and colours in [-1, 2], for networks "
+        "that learn these numbers; for the optimizer gaussian-adam, and for fits that are no video or file",
+    )
     # The length
     iterations: int | None = Field(
         None,
@@ -127,6 +132,8 @@ class FitConfig(BaseModel):
             raise InvalidArgument("backend", f"one of {', '.join(BACKENDS)}", repr(self.backend))
         if self.softness != "auto" and not 0.0 <= self.softness <= MAX_SOFTNESS:
             raise InvalidArgument("softness", f"'auto' or in [0, {MAX_SOFTNESS:g}] pixels", repr(self.softness))
+        if self.bounded and self.optimizer != "gaussian-adam":
+            raise InvalidArgument("bounded", f"False with the optimizer {self.optimizer}", True)
         if self.max_move != "any" and self.max_move < 1.0:
             raise InvalidArgument("max_move", "'any' or at least 1 pixel", repr(self.max_move))
 

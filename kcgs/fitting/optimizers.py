@@ -38,7 +38,11 @@ def optimizer_kind(problem: Problem) -> OptimizerKind:
 def _gaussian_adam(config: FitConfig, field: GaussianField, sigma: float) -> Any:
     factor = config.learning_rate_factor
     return GaussianAdam(
-        field, LEARNING_RATE * factor, color_lr=COLOR_LEARNING_RATE * factor, min_sigma=config.min_sigma
+        field,
+        LEARNING_RATE * factor,
+        color_lr=COLOR_LEARNING_RATE * factor,
+        min_sigma=config.min_sigma,
+        bounded=config.bounded,
     )
 
 

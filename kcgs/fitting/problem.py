@@ -144,6 +144,8 @@ def make_problem(
     """Check the arguments of a fit for a purpose."""
     if objects.objective is None:
         config = config.model_copy(update={"objective": objective_for(purpose, config.objective)})
+    if config.bounded and purpose != "fit":
+        raise InvalidArgument("bounded", f"False for a {purpose}", True)
     has_image = image is not None
     if image is None and objects.objective is not None:
         if size is None:

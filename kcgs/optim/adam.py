@@ -25,8 +25,10 @@ _THREAD_ROWS = 2048
 _MIN_FACTOR = 0.1
 # age of a row that does not move; loops and programs take every negative one as such
 FROZEN = -1.0
-# standard deviations by which a centre may lie outside the image
+# standard deviations by which a centre may lie outside the image, where fields are not bounded
 _MAX_OUTSIDE = 2.0
+# of the colours of bounded fields
+COLOR_RANGE = (-1.0, 2.0)
 
 
 def step_groups(state: dict[Tensor, Any], geometry: dict[str, Any], colors: dict[str, Any]) -> None:
@@ -37,11 +39,14 @@ def step_groups(state: dict[Tensor, Any], geometry: dict[str, Any], colors: dict
     parameters = geometry["params"] + colors["params"]
     if takes_triton(*parameters):
         _launch(state, geometry, colors)
-        return
-    finite = None if _checks_gradients(parameters[0]) else _finite_rows(parameters)
-    for group in groups:
-        step = _step_geometry if group is geometry else _step_colors
-        step(state[group["params"][0]], group, finite)
+    else:
+        finite = None if _checks_gradients(parameters[0]) else _finite_rows(parameters)
+        for group in groups:
+            step = _step_geometry if group is geometry else _step_colors
+            step(state[group["params"][0]], group, finite)
+    table = colors["params"][0]
+    if colors["bounded"] and table.requires_grad:
+        table.clamp_(*COLOR_RANGE)
 
 
 def _step_colors(state: dict[str, Tensor], group: dict[str, Any], finite: Tensor | None) -> None:
@@ -74,14 +79,14 @@ def _step_geometry(state: dict[str, Tensor], group: dict[str, Any], finite: Tens
         moves = means.requires_grad, cholesky.requires_grad
         adam = Adam(*_settings(group), *_averages(state))
         arrays = _rows(means, cholesky, *gradients)
-        loop = partial(loops.step_geometry, *arrays, moves, adam, _bounds(group))
+        loop = partial(loops.step_geometry, *arrays, moves, adam, bounds_of(group))
         run_tasks(loop, ranges(len(arrays[0]), _TASK_ROWS), 1 + len(arrays[0]) // _THREAD_ROWS)
         increment_version([parameter for parameter in group["params"] if parameter.requires_grad])
         return
     moving = _moving_rows(state["age"], finite)
     step = _adam(state, local_gradient(cholesky, *gradients), group, moving)
     step = step.clamp(-group["max_step"], group["max_step"])
-    moved = bounded(*move(means, cholesky, step), group["size"], group["min_sigma"])
+    moved = within_bounds(*move(means, cholesky, step), bounds_of(group))
     for parameter, values in zip((means, cholesky), moved, strict=True):
         if parameter.requires_grad:  # a frozen one is not even brought within bounds
             _write(parameter, values, moving)
@@ -98,13 +103,15 @@ def _launch(state: dict[Tensor, Any], geometry: dict[str, Any], colors: dict[str
         # where nothing moves any address will do: it is not read
         adams.append(Adam(*_settings(group), *(averages if moves else group["params"][:1] * 3)))
     parameters = geometry["params"] + colors["params"]
-    cuda.step(parameters, gradients, adams[0], adams[1], _bounds(geometry))
+    cuda.step(parameters, gradients, adams[0], adams[1], bounds_of(geometry))
     increment_version([p for p, gradient in zip(parameters, gradients, strict=True) if gradient is not None])
 
 
-def _bounds(group: dict[str, Any]) -> Bounds:
+def bounds_of(group: dict[str, Any]) -> Bounds:
     """Return the bounds of a step of a field's geometry."""
-    limits = group["max_step"], *group["size"], group["min_sigma"], _MIN_FACTOR, _MAX_OUTSIDE
+    size = group["size"]
+    max_outside, max_factor = (0.0, max(size)) if group["bounded"] else (_MAX_OUTSIDE, math.hypot(*size))
+    limits = group["max_step"], *size, group["min_sigma"], _MIN_FACTOR, max_outside, max_factor
     return Bounds(*map(float, limits))
 
 
@@ -210,17 +217,16 @@ def _write(table: Tensor, values: Tensor, moving: Tensor | None) -> None:
     table.copy_(values if moving is None else torch.where(moving & values.isfinite(), values, table))
 
 
-def bounded(means: Tensor, cholesky: Tensor, size: tuple[int, int], min_sigma: float) -> tuple[Tensor, Tensor]:
+def within_bounds(means: Tensor, cholesky: Tensor, bounds: Bounds) -> tuple[Tensor, Tensor]:
     """Move centres back to about the image, and make Gaussians neither too thin nor larger than the image."""
-    height, width = size
-    diagonal = math.hypot(height, width)
+    most = bounds.max_factor
     l11, l21, l22 = cholesky.unbind(-1)
-    l11, l22 = l11.clamp(_MIN_FACTOR, diagonal), l22.clamp(_MIN_FACTOR, diagonal)
-    l21 = l21.clamp(-diagonal, diagonal)
+    l11, l22, l21 = l11.clamp(bounds.min_factor, most), l22.clamp(bounds.min_factor, most), l21.clamp(-most, most)
     # no tensor of the size: its copy to a device would force a host sync
-    reaches, lengths = (_MAX_OUTSIDE * l11, _MAX_OUTSIDE * torch.hypot(l21, l22)), (width, height)
+    reaches = (bounds.max_outside * l11, bounds.max_outside * torch.hypot(l21, l22))
+    lengths = (bounds.width, bounds.height)
     places = [
         torch.minimum(torch.maximum(place, -reach), reach + length)
         for place, reach, length in zip(means.unbind(-1), reaches, lengths, strict=True)
     ]
-    return torch.stack(places, -1), widen(torch.stack([l11, l21, l22], -1), min_sigma)
+    return torch.stack(places, -1), widen(torch.stack([l11, l21, l22], -1), bounds.min_sigma)

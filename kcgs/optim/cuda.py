@@ -6,8 +6,6 @@ finite, stays as it is.
 
 from __future__ import annotations
 
-import math
-
 import torch
 import triton
 import triton.language as tl
@@ -40,7 +38,7 @@ def step(tables: list[Tensor], gradients: list[Tensor | None], geometry: Adam, c
         _step(
             (-(-count // _ROWS),),
             *tables[:3], *opacities, *addresses[:3], *(addresses[3:] or tables[:1]), *geometry, *colors, *bounds,
-            math.hypot(bounds.height, bounds.width), count,
+            count,
             CHANNELS=channels, COLUMNS=channels + len(tables[3:]), MEANS=has_gradient[0], CHOLESKY=has_gradient[1],
             COLORS=has_gradient[2], OPACITIES=has_gradient[3], LR_LOADED=isinstance(geometry.lr, Tensor),
             COLOR_LR_LOADED=isinstance(colors.lr, Tensor), ROWS=_ROWS,
@@ -99,7 +97,7 @@ def _step(
     means, cholesky, colors, opacities, means_gradient, cholesky_gradient, colors_gradient, opacities_gradient,
     lr, beta1, beta2, eps, age, average, square,
     color_lr, color_beta1, color_beta2, color_eps, color_age, color_average, color_square,
-    max_step, height, width, min_sigma, min_factor, max_outside, diagonal, count,
+    max_step, height, width, min_sigma, min_factor, max_outside, max_factor, count,
     CHANNELS: tl.constexpr, COLUMNS: tl.constexpr, MEANS: tl.constexpr, CHOLESKY: tl.constexpr, COLORS: tl.constexpr,
     OPACITIES: tl.constexpr, LR_LOADED: tl.constexpr, COLOR_LR_LOADED: tl.constexpr, ROWS: tl.constexpr,
 ):  # fmt: skip
@@ -160,8 +158,8 @@ def _step(
         e1, e2, gap = tl.exp(k11), tl.exp(k22), k11 - k22
         is_small = tl.abs(gap) < 1e-4
         mean = tl.where(is_small, 0.5 * (e1 + e2), (e1 - e2) / tl.where(is_small, 1.0, gap))
-        l21 = _clamp(l21 * e1 + l22 * k21 * mean, -diagonal, diagonal)
-        l11, l22 = _clamp(l11 * e1, min_factor, diagonal), _clamp(l22 * e2, min_factor, diagonal)
+        l21 = _clamp(l21 * e1 + l22 * k21 * mean, -max_factor, max_factor)
+        l11, l22 = _clamp(l11 * e1, min_factor, max_factor), _clamp(l22 * e2, min_factor, max_factor)
         if MEANS:
             outside_x, outside_y = max_outside * l11, max_outside * tl.sqrt(l21 * l21 + l22 * l22)
             x = tl.load(means + 2 * row, mask=mask, other=0.0) + shift_x

@@ -14,7 +14,7 @@ from kcgs._check import check_number
 from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.nn import GaussianField
 
-from .adam import FROZEN, begin, bounded, check_gradients, step_groups
+from .adam import COLOR_RANGE, FROZEN, begin, bounds_of, check_gradients, step_groups, within_bounds
 
 # steps of place in standard deviations and of log scale, and steps of colours: found on photos, and good on all images
 LEARNING_RATE = 0.14
@@ -39,6 +39,8 @@ class GaussianAdam(Optimizer):
         min_sigma: least standard deviation, in pixels. Thinner Gaussians fit the pixels' centres better, and are dots
             and needles when a scene is enlarged.
         max_step: the largest step of place and of log scale.
+        bounded: keep closer bounds, for numbers that a network learns: centres within the image, factors below its
+            longer side, colours in [-1, 2].
 
     Raises:
         TypeError: something else than fields, or a setting that is no number.
@@ -70,6 +72,7 @@ class GaussianAdam(Optimizer):
         eps: float = 1e-12,
         min_sigma: float = 0.5,
         max_step: float = 0.5,
+        bounded: bool = False,
     ) -> None:
         for name, value in {"lr": lr, "color_lr": color_lr, "eps": eps, "min_sigma": min_sigma}.items():
             check_number(name, float(value) if isinstance(value, Tensor) else value, 0.0)
@@ -87,7 +90,8 @@ class GaussianAdam(Optimizer):
             colors = [field.colors] if field.opacities is None else [field.colors, field.opacities]
             groups.append({"kind": "geometry", "params": geometry, "lr": lr, "size": field.size})
             groups.append({"kind": "colors", "params": colors, "lr": color_lr})
-        super().__init__(groups, {"betas": betas, "eps": eps, "min_sigma": min_sigma, "max_step": max_step})
+        settings = {"betas": betas, "eps": eps, "min_sigma": min_sigma, "max_step": max_step, "bounded": bounded}
+        super().__init__(groups, settings)
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
@@ -129,9 +133,10 @@ class GaussianAdam(Optimizer):
         """
         if _layout(field) != _layout(added):
             raise InvalidArgument("added", _layout(field), _layout(added), verb="have")
-        min_sigma = self._group(field)["min_sigma"]
-        means, cholesky = bounded(added.means, added.cholesky, field.size, min_sigma)
-        parts = {"means": means, "cholesky": cholesky, "colors": added.colors, "opacities": added.opacities}
+        geometry = self._group(field)
+        means, cholesky = within_bounds(added.means, added.cholesky, bounds_of(geometry))
+        colors = added.colors.clamp(*COLOR_RANGE) if geometry["bounded"] else added.colors
+        parts = {"means": means, "cholesky": cholesky, "colors": colors, "opacities": added.opacities}
         rows = means.ndim - 2
         for name, part in parts.items():
             if part is not None:

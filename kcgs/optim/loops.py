@@ -101,7 +101,7 @@ def _step_geometry(means, cholesky, means_gradient, cholesky_gradient, moves, ad
         step[0], step[1] = l11 * gx + l21 * gy, l22 * gy
         step[2], step[3], step[4] = l11 * g11 + l21 * g21, l22 * g21, l22 * g22
     _step(steps, adam, begin)
-    most, diagonal = bounds.max_step, math.hypot(bounds.height, bounds.width)
+    most, max_factor = bounds.max_step, bounds.max_factor
     for i in range(begin, end):
         step = steps[i - begin]
         l11, l21, l22 = np.float64(cholesky[i, 0]), np.float64(cholesky[i, 1]), np.float64(cholesky[i, 2])
@@ -110,8 +110,8 @@ def _step_geometry(means, cholesky, means_gradient, cholesky_gradient, moves, ad
         k11, k22 = _clamp(np.float64(step[2]), -most, most), _clamp(np.float64(step[4]), -most, most)
         k21, e1, e2, gap = _clamp(np.float64(step[3]), -most, most), math.exp(k11), math.exp(k22), k11 - k22
         mean = 0.5 * (e1 + e2) if abs(gap) < 1e-4 else (e1 - e2) / gap
-        l21 = _clamp(l21 * e1 + l22 * k21 * mean, -diagonal, diagonal)
-        l11, l22 = _clamp(l11 * e1, bounds.min_factor, diagonal), _clamp(l22 * e2, bounds.min_factor, diagonal)
+        l21 = _clamp(l21 * e1 + l22 * k21 * mean, -max_factor, max_factor)
+        l11, l22 = _clamp(l11 * e1, bounds.min_factor, max_factor), _clamp(l22 * e2, bounds.min_factor, max_factor)
         if moves[0]:
             outside_x, outside_y = bounds.max_outside * l11, bounds.max_outside * math.sqrt(l21 * l21 + l22 * l22)
             means[i, 0] = _clamp(x, -outside_x, bounds.width + outside_x)

@@ -26,3 +26,4 @@ class Bounds(NamedTuple):
     min_sigma: float
     min_factor: float
     max_outside: float  # in standard deviations
+    max_factor: float

@@ -16,7 +16,7 @@ from PIL import Image
 from kcgs import GaussianField, Scene, fit, load
 from kcgs.cli import demo
 from kcgs.cli.common import InterruptHandler
-from kcgs.data import load_image, load_labels, save_labels
+from kcgs.data import load_image, load_labels, save_image, save_labels
 from kcgs.functional import psnr
 from kcgs.segment import segment
 from tests.cli.conftest import Kcgs
@@ -48,13 +48,36 @@ class TestFit:
 
     def test_same_scene_as_in_python(self, kcgs: Kcgs) -> None:
         """The default output is named after the image."""
-        assert "psnr" in kcgs("fit", "photo.png", "-n", "12", "--iterations", "20").out
-        image, scene = load_image("photo.png"), load("photo.safetensors")
+        save_image("large.png", load_image("photo.png").repeat_interleave(2, 1).repeat_interleave(2, 2))
+        assert "psnr" in kcgs("fit", "large.png", "-n", "12", "--iterations", "20").out
+        image, scene = load_image("large.png"), load("large.safetensors")
         result = fit(image, segment(image), 12, iterations=20)
         for name in ("means", "cholesky", "colors", "region_ids"):
             assert torch.equal(getattr(scene.field, name), getattr(result.scene.field, name)), name
         assert scene.regions is not None and result.scene.regions is not None
         assert torch.equal(scene.regions.labels, result.scene.regions.labels)
+
+    def test_small_images_have_no_regions(self, kcgs: Kcgs) -> None:
+        assert kcgs(*FIT, "--iterations", "5").out.endswith("regions: none, for a side is below 64 pixels\n")
+        assert load("scene.safetensors").regions is None
+
+    def test_grey(self, kcgs: Kcgs) -> None:
+        """Scenes of one channel are compared with, and compressed by, the luma of an image."""
+        report = json.loads(kcgs(*FIT, "--regions", "mask.png", "--grey", "--json").out)
+        scene = load("scene.safetensors")
+        assert scene.render().shape == (1, 40, 60)
+        assert float(psnr(scene.render(), load_image("photo.png", channels="L"))) == pytest.approx(report["psnr"])
+        assert json.loads(kcgs("eval", "scene.safetensors", "photo.png", "--json").out)["psnr"] == report["psnr"]
+        assert kcgs("encode", "scene.safetensors", "--image", "photo.png", "-o", "grey.kcgs").code == 0
+        assert load("grey.kcgs").render().shape == (1, 40, 60)
+
+    def test_bounded(self, kcgs: Kcgs) -> None:
+        assert kcgs(*FIT, "--bounded").code == 0
+        field = load("scene.safetensors").field
+        assert ((field.means >= 0) & (field.means <= torch.tensor([60.0, 40.0]))).all()
+        assert field.colors.min() >= -1 and field.colors.max() <= 2
+        code, _, err = kcgs("fit", "photo.png", "--target-bytes", 300, "--bounded")
+        assert code == 2 and "must be False for a file of a size; got True" in err
 
     def test_keep_contours(self, kcgs: Kcgs) -> None:
         assert "\nregions: 2 of 2 regions kept\n" in kcgs(*FIT, "--regions", "mask.png", "--keep-contours").out

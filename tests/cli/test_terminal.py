@@ -11,10 +11,12 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import pytest
+import torch
 
 import kcgs.page.server
 import kcgs.rate  # imports the functions of other modules before a test replaces one
 from kcgs import GaussianField, Scene
+from kcgs.data import save_image
 from tests.cli.conftest import Kcgs
 
 
@@ -22,6 +24,7 @@ from tests.cli.conftest import Kcgs
 def _files(photo: None) -> None:
     for suffix in ("safetensors", "kcgs"):
         Scene(GaussianField.random(5, (32, 48), seed=0)).save(f"scene.{suffix}")
+    save_image("big.png", torch.zeros(3, 64, 64))
 
 
 def interrupt(*_: object, **__: object) -> NoReturn:
@@ -31,10 +34,10 @@ def interrupt(*_: object, **__: object) -> NoReturn:
 @pytest.mark.parametrize(
     ("name", "arguments"),
     [
-        ("kcgs.segment.segment", ("fit", "photo.png", "-n", "5")),
+        ("kcgs.segment.segment", ("fit", "big.png", "-n", "5")),
         ("kcgs.segment.segment_with_scores", ("segment", "photo.png", "-o", "map.png")),
         ("kcgs.fitting.fit", ("fit", "photo.png", "-n", "5", "--regions", "none")),
-        ("kcgs.codec.encode", ("encode", "scene.safetensors", "-o", "new.kcgs")),
+        ("kcgs.files.encode", ("encode", "scene.safetensors", "-o", "new.kcgs")),
         ("kcgs.page.serve", ("view", "scene.safetensors")),
     ],
 )

@@ -35,7 +35,7 @@ def test_steps() -> None:
 
 NUMBERS = {
     *("beta1", "beta2", "eps", "color_beta1", "color_beta2", "color_eps"),
-    *("max_step", "height", "width", "diagonal", "min_sigma", "min_factor", "max_outside"),
+    *("max_step", "height", "width", "max_factor", "min_sigma", "min_factor", "max_outside"),
 }
 
 

@@ -88,6 +88,18 @@ class TestStep:
         outside = torch.maximum(-field.means, field.means - torch.tensor([36.0, 24.0])).detach()
         assert float(outside.max()) <= 2 * float(sigma.max()) + 1e-3
 
+    def test_bounded(self, kind: str) -> None:
+        """Rows that are added, too."""
+        field = field_of(kind)
+        optimizer = GaussianAdam(field, 1.0, color_lr=1.0, bounded=True)
+        descend(field, optimizer, 30, regions_of(kind))
+        added = field_of(kind)
+        added.colors.data *= 9.0
+        optimizer.append(field, added)
+        assert ((field.means >= 0) & (field.means <= torch.tensor([36.0, 24.0]))).all()
+        assert (field.cholesky.abs() <= 36).all() and ((field.colors >= -1) & (field.colors <= 2)).all()
+        assert field.colors.max() == 2
+
     def test_a_field_without_gradients_stays(self, kind: str) -> None:
         field = field_of(kind)
         before = copy.deepcopy(field)
@@ -128,14 +140,14 @@ class TestAlgorithm:
         for value, expected in zip(tensors(field), (means, cholesky, tones.detach()), strict=True):
             torch.testing.assert_close(value, expected, rtol=1e-6, atol=1e-8)
 
-    @pytest.mark.parametrize("kind", ["plain", "opacities", "batch", "strided"])
+    @pytest.mark.parametrize("kind", ["plain", "opacities", "batch", "strided", "bounded"])
     def test_compiled_loops_take_the_steps_of_torch_operations(self, kind: str) -> None:
         """In float32 and in float64, with the same gradients, of rows that are of two ages and reach the bounds."""
-        field = field_of("plain" if kind == "strided" else kind)
+        field = field_of(kind if kind in KINDS else "plain")
         if kind == "strided":
             field.means = nn.Parameter(field.means.detach().mT.contiguous().mT)
         twin, generator = copy.deepcopy(field).double(), torch.Generator().manual_seed(2)
-        optimizers = [GaussianAdam(each, 0.5, min_sigma=2.0) for each in (field, twin)]
+        optimizers = [GaussianAdam(each, 0.5, min_sigma=2.0, bounded=kind == "bounded") for each in (field, twin)]
         for step in range(6):
             if step == 3:
                 for each, optimizer in zip((field, twin), optimizers, strict=True):

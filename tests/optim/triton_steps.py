@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -59,12 +60,13 @@ def states(optimizer: GaussianAdam) -> list[Tensor]:
     return [values for state in optimizer.state.values() for values in state.values()]
 
 
-@pytest.mark.parametrize("kind", ["plain", "channels", "opacities", "batch", "frozen"])
+@pytest.mark.parametrize("kind", ["plain", "channels", "opacities", "batch", "frozen", "bounded"])
 def test_takes_the_steps_of_torch_operations(kind: str, launches: list[int]) -> None:
     """In float32 and in float64, of rows that are of two ages, reach the bounds, and have NaN at times."""
     field, generator = field_of(kind), torch.Generator().manual_seed(2)
     twin = copy.deepcopy(field).double()
-    optimizers = [GaussianAdam(each, 0.5, min_sigma=2.0) for each in (field, twin)]
+    settings: dict[str, Any] = {"min_sigma": 2.0, "bounded": kind == "bounded"}
+    optimizers = [GaussianAdam(each, 0.5, **settings) for each in (field, twin)]
     for step in range(6):
         if step == 3:
             for each, optimizer in zip((field, twin), optimizers, strict=True):
