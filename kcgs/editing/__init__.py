@@ -5,7 +5,7 @@ from .masks import check_offset, dilate, nearest_labels, shift_labels
 from .recoloring import recolor_region
 from .render import render_over, render_region
 from .scenes import delete_region, extract_region, move_region, replace_background
-from .selection import members_of, unique_region_ids
+from .selection import members_of, unique_region_ids, warn_of_lost_regions
 
 # public; what else is imported here is for the other rooms of kcgs
 __all__ = [

@@ -8,7 +8,6 @@ from collections.abc import Iterable, Sequence
 import torch
 
 from kcgs._check import check_count
-from kcgs._warn import warn_user
 from kcgs.functional import RegionMap
 from kcgs.maps import PairSoftness, touching_pairs
 from kcgs.nn import GaussianField, join, scaled_gaussians
@@ -16,7 +15,7 @@ from kcgs.scene import Scene, check_scene
 
 from .fill import MARGIN, fill_hole
 from .masks import check_offset, dilate, nearest_labels, shift_labels
-from .selection import members_of, select_regions, select_removable_regions
+from .selection import members_of, select_regions, select_removable_regions, warn_of_lost_regions
 
 # standard deviations of a soft contour beyond which it is taken as 0 or 1
 _CONTOUR_SIGMAS = 4.0
@@ -69,11 +68,7 @@ def move_region(
     check_count("margin", margin, 0)
     background_labels = nearest_labels(regions.labels, hole)
     landing, labels = shift_labels(regions.labels, hole, steps, background_labels)
-
-    lost_ids = regions.ids[~torch.isin(regions.ids, labels)].tolist()
-    if lost_ids:
-        warn_user(f"regions {', '.join(map(str, lost_ids))} are lost: covered, or out of the image")
-
+    warn_of_lost_regions(regions, labels)
     field = scene.field
     if fill and (hole & ~landing).any():
         background = Scene(field.subset(~selection.members), regions.relabel(background_labels, "mean"))

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_count
+from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
@@ -72,3 +73,9 @@ def members_of(field: GaussianField, ids: Tensor) -> Tensor:
     """Return which Gaussians of a field with region ids belong to some regions, (..., N) bool."""
     assert field.region_ids is not None
     return torch.isin(field.region_ids, ids)
+
+
+def warn_of_lost_regions(regions: RegionMap, labels: Tensor) -> None:
+    """Warn of regions that labels, of one image or of all frames, do not have any more."""
+    if lost_ids := regions.ids[~torch.isin(regions.ids, labels)].tolist():
+        warn_user(f"regions {', '.join(map(str, lost_ids))} are lost: covered, or out of the image")

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kcgs.compiled import threads_for_kernels
-from kcgs.editing import check_offset, shift_labels, unique_region_ids
+from kcgs.editing import check_offset, shift_labels, unique_region_ids, warn_of_lost_regions
 from kcgs.fitting import FitConfig
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField, join
@@ -94,6 +94,9 @@ def move_in_video(scenes: Scene, region_ids: int | Iterable[int], offset: Sequen
 
     Raises:
         TypeError, ValueError: as :func:`delete_from_video`; an offset that is not two whole numbers.
+
+    Warns:
+        UserWarning: regions are lost in all frames; it names their ids.
     """
     regions, row_ids, ids = _check(scenes, region_ids)
     steps = check_offset(offset)
@@ -105,6 +108,7 @@ def move_in_video(scenes: Scene, region_ids: int | Iterable[int], offset: Sequen
     colors = (field.merged_colors() * is_member[..., None])[:, rows]
     region_field = GaussianField(means, field.cholesky[:, rows], colors, row_ids[:, rows], size=scenes.size)
     labels = shift_labels(regions.labels, torch.isin(regions.labels, ids), steps, background.regions.labels)[1]
+    warn_of_lost_regions(regions, labels)
     return Scene(join(background.field, region_field), regions.relabel(labels, "mean"), scenes.metadata)
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kcgs import Scene
-from kcgs.editing import recolor_region
+from kcgs.editing import move_region, recolor_region
 from kcgs.editing.masks import dilate
 from kcgs.functional import psnr
 from kcgs.video import delete_from_video, fit_video, interpolate, move_in_video
@@ -153,6 +153,16 @@ class TestEdits:
         inside = labels == 7
         difference = moved[2].render()[:, 8:, 10:] - scenes[2].render()[:, :-8, :-10]
         assert difference[:, inside[8:, 10:]].abs().mean() < 0.02
+
+    def test_a_frame_moves_as_an_image_does(self, scenes: Scene) -> None:
+        """To the same map, with the same softness, and a loss is said."""
+        moved, image = move_in_video(scenes, 7, (10, 8)), move_region(scenes[2], 7, (10, 8))
+        assert moved.regions is not None and image.regions is not None
+        assert torch.equal(moved.regions.labels[2], image.regions.labels)
+        assert moved.regions[2].softness == image.regions.softness
+        for move, each in ((move_in_video, scenes), (move_region, scenes[2])):
+            with pytest.warns(UserWarning, match="regions 7 are lost: covered, or out of the image"):
+                move(each, 7, (100, 0))
 
     def test_recolor(self, scenes: Scene) -> None:
         """All frames at once: the disc of each gets the same gain and bias."""
