@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import os
 import time
-from functools import cache
 from pathlib import Path
 from statistics import fmean
 
 import torch
-from torch import Tensor
 
 from kcgs import FitConfig, fit
 from kcgs.fitting import precompile
@@ -51,24 +49,11 @@ peak. As printed, on GPUs: {
 }."""
 
 
-@cache
-def read(image: str, data: str, quick: bool) -> Tensor:
-    """Read a photo of Kodak, or put some side by side, upright ones turned."""
-    if image not in (*LARGE, HUGE):
-        return load(image, data, quick).image
-    names = choose(Options(Path(), Path(data) if data else None, quick), "kodak")
-    photos = [load(name, data, quick).image for name in names]
-    photos = [photo if photo.shape[2] >= photo.shape[1] else photo.mT for photo in photos]
-    rows, columns, first = (6, 4, 0) if image == HUGE else (2, 2, 3 * LARGE.index(image))
-    picked = [photos[(first + k) % len(photos)] for k in range(rows * columns)]
-    return torch.cat([torch.cat(picked[k : k + columns], 2) for k in range(0, len(picked), columns)], 1).contiguous()
-
-
 def measure(image: str, method: str, counts: list[int], data: str, quick: bool) -> list[Row]:
     """Fit an image with ever more Gaussians."""
     device = "cuda" if method == GPU else "cpu"
     config = FitConfig(iterations=QUICK_ITERATIONS if quick else None)
-    pixels, rows = read(image, data, quick).to(device), []
+    pixels, rows = load(image, data, quick).image.to(device), []
     with threads(os.cpu_count() or 1):
         precompile(config, device)
         for n in counts:
@@ -93,7 +78,7 @@ def measure(image: str, method: str, counts: list[int], data: str, quick: bool) 
 
 def fit_by_name(image: str, data: str, quick: bool, method: str, config: FitConfig, n: int) -> None:
     """Fit an image, for a clock of memory."""
-    fit(read(image, data, quick).to("cuda" if method == GPU else "cpu"), None, n, recipe=config)
+    fit(load(image, data, quick).image.to("cuda" if method == GPU else "cpu"), None, n, recipe=config)
 
 
 def set_of(image: str) -> str:

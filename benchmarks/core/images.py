@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -21,6 +22,8 @@ CHARTS = ("2x3", "pie")
 FRAMES = ("blackswan", "breakdance", "car-turn", "dance-jump", "dog", "train")
 PHOTOS = ("astronaut", "chelsea", "coffee", "rocket")
 QUICK_STRIDE = 4
+# columns and rows of photos of Kodak side by side, and where in the list they begin, by threes
+STITCHED = re.compile(r"(\d+) x (\d+) photos(?: (\d+))?")
 
 
 class Sample(NamedTuple):
@@ -34,6 +37,7 @@ class Sample(NamedTuple):
 def load(name: str, data: str | None = None, quick: bool = False) -> Sample:
     """Read a chart, "disc", a photo of scikit-image, BSDS (a number), Kodak (kodimN), or a sequence's first frame.
 
+    "4 x 6 photos" are those of Kodak in four columns and six rows, "2 x 2 photos 3" four others than "2 x 2 photos 2".
     The quick form has one of four pixels a side.
     """
     stride = QUICK_STRIDE if quick else 1
@@ -86,8 +90,18 @@ def _read(name: str, data: Path) -> tuple[Tensor, Tensor | None]:
         return load_image(data / "bsds" / name / "image.jpg"), None
     if name.startswith("kodim"):
         return load_image(data / "kodak" / f"{name}.png"), None
+    if match := STITCHED.fullmatch(name):
+        columns, rows, part = (int(number or 1) for number in match.groups())
+        return _stitch(names(data, "kodak"), columns, rows, 3 * (part - 1), data), None
     frame = Davis(data / "DAVIS")[name]
     return frame.image, frame.labels
+
+
+def _stitch(photos: list[str], columns: int, rows: int, first: int, data: Path) -> Tensor:
+    """Put photos side by side, upright ones turned."""
+    images = [_read(photos[(first + k) % len(photos)], data)[0] for k in range(rows * columns)]
+    images = [image if image.shape[2] >= image.shape[1] else image.mT for image in images]
+    return torch.cat([torch.cat(images[k : k + columns], 2) for k in range(0, len(images), columns)], 1)
 
 
 def _disc() -> tuple[Tensor, Tensor]:
