@@ -83,3 +83,9 @@ def test_help_and_usage_errors_load_no_torch() -> None:
 
 def test_an_import_is_light_and_changes_nothing() -> None:
     assert not HEAVY & set(json.loads(run(IMPORT)))
+
+
+def test_a_fit_loads_no_compiler_of_torch() -> None:
+    """It takes one to three seconds, which every process of `kcgs fit` would spend."""
+    code = "import sys, torch, kcgs; kcgs.fit(torch.rand(3, 24, 32), num_gaussians=9, iterations=3); print(*sys.modules)"
+    assert "torch._dynamo" not in run(code).split()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from inspect import unwrap
 from typing import Any
 
 import torch
@@ -118,7 +119,8 @@ class GaussianAdam(Optimizer):
         if "kind" not in param_group:
             expected = "a GaussianField's: train other parameters with an optimizer of their own"
             raise InvalidArgument("param_group", expected, f"one of {[*param_group]}")
-        super().add_param_group(param_group)
+        # unwrapped: torch's decorator, which keeps it out of torch.compile, imports all of its compiler, 1 to 3 seconds
+        unwrap(Optimizer.add_param_group)(self, param_group)
 
     @torch.no_grad()
     def append(self, field: GaussianField, added: GaussianField) -> None:
