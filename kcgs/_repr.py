@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import io
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-import torch
-from torch import Tensor
+if TYPE_CHECKING:  # the command line reads the zoo without torch
+    from torch import Tensor
 
 T = TypeVar("T")
 
@@ -50,6 +50,6 @@ def png(image: Tensor) -> bytes | None:
 
     if image.ndim != 3 or image.shape[0] not in (1, 3, 4):
         return None
-    levels = (image.float() * 255).round().to(torch.uint8).permute(1, 2, 0).squeeze(-1).cpu().numpy()
+    levels = (image.float() * 255).round().byte().permute(1, 2, 0).squeeze(-1).cpu().numpy()
     Image.fromarray(levels).save(file := io.BytesIO(), "PNG")
     return file.getvalue()
