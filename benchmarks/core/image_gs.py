@@ -139,9 +139,9 @@ def l1_and_ssim(image: Tensor) -> Callable[[Tensor], Tensor]:
     return lambda render: (render - image).abs().mean() + _SSIM_WEIGHT * (1 - ssim(render, image[None]).mean())
 
 
-# what jobs, which are plain values, have a name for
-OBJECTS: dict[Any, Any] = {"gradient": gradient_field, "largest-error": DensifyAtLargestError(), "adam": ImageGSAdam}
-# with an objective beside them, "l1" or `l1_and_ssim`
+# by the names that they have in jobs, which are plain values
+OBJECTS: dict[str, Any] = {"gradient": gradient_field, "largest-error": DensifyAtLargestError(), "adam": ImageGSAdam}
+# `fit(image, **{name: OBJECTS.get(value, value) for name, value in SETTINGS.items()}, objective=l1_and_ssim(image))`
 SETTINGS: dict[str, Any] = {
     "guidance": False, "clamp": False, "initializer": "gradient", "densify": "largest-error", "densify_from": 0.5,
     "move_contours": False, "merge_regions": False, "optimizer": "adam", "prune": 0.0, "iterations": 10_000,
