@@ -5,11 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from statistics import fmean
 
-from kcgs import FitConfig
-
 from .core.compare import Comparison, differences, group_by, losses_table, means_table, values_of
 from .core.figures import Panel, save_lines
-from .core.fits import METHODS, QUICK_ITERATIONS, config_of, figures, fit_for, timed_fit
+from .core.fits import METHODS, QUICK_ITERATIONS, figures, fit_for, method_of, timed_fit
 from .core.images import STITCHED, choose, load_mapped
 from .core.run import RESULTS_FILE, Job, Options, Page, Row, read_rows
 from .gpu_fit import GPU
@@ -40,12 +38,11 @@ def measure(image: str, method: str, n: int, data: str, quick: bool) -> list[Row
     pixels, labels = load_mapped(image, data, quick)
     rows: list[Row] = []
     if image in CLOCKS:
-        config = FitConfig.from_recipe(method, max_seconds=CLOCKS[image])
-        result, seconds = timed_fit(pixels, labels, n, config)
+        result, seconds = timed_fit(pixels, labels, n, (method, {"max_seconds": CLOCKS[image]}))
         return [{"image": image, "method": method, "budget": CLOCKS[image], **figures(result, seconds, pixels, labels)}]
     for budget in BUDGETS:
         if quick:
-            result, seconds = timed_fit(pixels, labels, n, config_of(method, QUICK_ITERATIONS + budget))
+            result, seconds = timed_fit(pixels, labels, n, method_of(method, QUICK_ITERATIONS + budget))
         else:
             result, seconds = fit_for(budget, pixels, labels, n, method)
         row = {"image": image, "method": method, "budget": budget}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from kcgs import FitConfig
 from kcgs.segment import segment
 
 from .core.compare import Comparison, at_equal_bits, differences, join_tables, losses_table, mean_gain, means_table
@@ -36,7 +35,7 @@ def measure(image: str, n: int, methods: list[str], data: str, quick: bool) -> l
     rows = []
     for method in methods:
         recipe = "best" if method == MAP else "best-baseline"
-        result, seconds = timed_fit(pixels, labels, n, FitConfig.from_recipe(recipe, **length))
+        result, seconds = timed_fit(pixels, labels, n, (recipe, length))
         rows.append({**row, "method": method, **figures(result, seconds, pixels, labels)})
     return rows
 

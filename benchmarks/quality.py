@@ -16,7 +16,7 @@ from .core.compare import (
     means_table,
 )
 from .core.figures import Panel, save_lines
-from .core.fits import METHODS, QUICK_ITERATIONS, config_of, figures, fit_for, timed_fit
+from .core.fits import METHODS, QUICK_ITERATIONS, figures, fit_for, method_of, timed_fit
 from .core.images import PHOTOS, load_mapped, names
 from .core.run import Job, Options, Page, Row
 
@@ -46,8 +46,8 @@ def measure(image: str, group: str, n: int, data: str, quick: bool) -> list[Row]
         if rows and not quick:
             result, seconds = fit_for(rows[0]["core_seconds"], pixels, labels, n, method)
         else:
-            config = config_of(method, QUICK_ITERATIONS if quick else None)
-            result, seconds = timed_fit(pixels, labels, n, config)
+            length = QUICK_ITERATIONS if quick else None
+            result, seconds = timed_fit(pixels, labels, n, method_of(method, length))
         row = {"image": image, "group": group, "n": n, "method": method}
         rows.append(row | figures(result, seconds, pixels, labels))
     return rows

@@ -21,6 +21,7 @@ from kcgs.data import ChartSample, Davis, DavisFrame, SceneDataset, save_image, 
 from kcgs.fitting import FitResult, available_recipes
 from kcgs.fitting.events import Densify
 from kcgs.fitting.problem import make_problem
+from kcgs.fitting.published.gaussian_image import GaussianImageAdan
 from kcgs.fitting.start import start
 from kcgs.functional import PairSoftness
 from kcgs.rate import Compressed, FitBytesResult
@@ -50,6 +51,7 @@ def objects(result: FitResult, folder: Path) -> Iterator[Any]:
     yield from (result, result.history[0], result.regions, field, regions, regions.resize((128, 192)), scene)
     yield from (PairSoftness(WIDTHS), RegionSplatRenderer())
     yield from (start(make_problem(image, LABELS, 400, FitConfig(), 0)), Densify())
+    yield GaussianImageAdan(GaussianField.random(3, SIZE, seed=0), 2.0, 100, 1.0)
     yield from (FitConfig.from_recipe(recipe) for recipe in available_recipes())
     yield from (codec.decode(data), Compressed(data, scene), FitBytesResult(data, scene, result), prune(result.scene))
     yield from (Segmentation(LABELS, torch.rand(21), {i: f"name {i}" for i in range(21)}), Cleanup())

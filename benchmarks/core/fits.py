@@ -17,6 +17,7 @@ from kcgs.fitting import precompile
 from kcgs.functional import ef_psnr, ms_ssim, psnr
 from kcgs.rate import quality_for
 
+from . import image_gs
 from .images import load_mapped
 from .run import Job, Options, Row
 
@@ -27,12 +28,13 @@ TRIAL_ITERATIONS = (50, 200)
 TOLERANCE = 0.12
 # of reports, by the names that `kcgs.evaluate` gives them; those of contours begin with ef_
 METRICS: dict[str, Callable[..., Tensor]] = {"psnr": psnr, "ef_psnr": ef_psnr, "ms_ssim": ms_ssim}
-Method = tuple[str, dict[str, Any]]  # a recipe, and settings that differ from it
+# a recipe, and arguments of `fit` that differ from it: plain values, or names of `image_gs.OBJECTS`
+Method = tuple[str, dict[str, Any]]
 # that are compared in as much time
 METHODS: dict[str, Method] = {
     **{name: (name, {}) for name in ("best", "best-baseline", "paper", "gaussian-image", "gaussian-image-clamp")},
     # SSIM in torch takes ten times as long as all else: with it there would be 20 iterations
-    "image-gs, L1 alone": ("image-gs", {"objective": "l1"}),
+    "image-gs, L1 alone": ("best", {**image_gs.SETTINGS, "objective": "l1"}),
 }
 
 
@@ -51,33 +53,36 @@ def measure_fit(
 ) -> list[Row]:
     """Fit and measure."""
     pixels, labels = load_mapped(image, data, quick)
-    result, seconds = timed_fit(pixels, labels, n, FitConfig.from_recipe(recipe, **settings))
+    result, seconds = timed_fit(pixels, labels, n, (recipe, settings))
     return [{"image": image, "n": n, "method": method, **figures(result, seconds, pixels, labels)}]
 
 
-def timed_fit(image: Tensor, labels: Tensor, n: int, config: FitConfig) -> tuple[FitResult, float]:
+def timed_fit(image: Tensor, labels: Tensor, n: int, method: Method) -> tuple[FitResult, float]:
     """Fit, and return the processor time, too; compilation is not in it."""
+    recipe, settings = method
+    objects = {name: image_gs.OBJECTS[value] for name, value in settings.items() if value in image_gs.OBJECTS}
+    config = FitConfig.from_recipe(recipe, **{name: settings[name] for name in settings.keys() - objects.keys()})
     precompile(config)
     start = time.process_time()
-    result = fit(image, labels, n, recipe=config)
+    result = fit(image, labels, n, recipe=config, **objects)
     return result, time.process_time() - start
 
 
 def fit_for(seconds: float, image: Tensor, labels: Tensor, n: int, method: str) -> tuple[FitResult, float]:
     """Fit for so many seconds of a core: two short fits tell how many iterations that are; a miss is corrected once."""
-    short, long = (timed_fit(image, labels, n, config_of(method, count))[1] for count in TRIAL_ITERATIONS)
+    short, long = (timed_fit(image, labels, n, method_of(method, count))[1] for count in TRIAL_ITERATIONS)
     per_iteration = max(long - short, 1e-3) / (TRIAL_ITERATIONS[1] - TRIAL_ITERATIONS[0])
     iterations = max(1, round(TRIAL_ITERATIONS[0] + (seconds - short) / per_iteration))
-    result, needed = timed_fit(image, labels, n, config_of(method, iterations))
+    result, needed = timed_fit(image, labels, n, method_of(method, iterations))
     if abs(needed / seconds - 1) > TOLERANCE:
-        result, needed = timed_fit(image, labels, n, config_of(method, max(1, round(iterations * seconds / needed))))
+        result, needed = timed_fit(image, labels, n, method_of(method, max(1, round(iterations * seconds / needed))))
     return result, needed
 
 
-def config_of(method: str, iterations: int | None) -> FitConfig:
-    """Return the settings of one of METHODS for so many iterations, None: the recipe's own."""
-    recipe, settings = METHODS[method]
-    return FitConfig.from_recipe(recipe, **settings, **({} if iterations is None else {"iterations": iterations}))
+def method_of(name: str, iterations: int | None) -> Method:
+    """Return one of METHODS for so many iterations, None: its own."""
+    recipe, settings = METHODS[name]
+    return recipe, settings if iterations is None else {**settings, "iterations": iterations}
 
 
 def figures(result: FitResult, seconds: float, image: Tensor, labels: Tensor) -> Row:

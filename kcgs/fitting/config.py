@@ -18,7 +18,12 @@ from kcgs.maps import MAX_SOFTNESS
 
 _USUAL_ITERATIONS = 700
 # settings of version 0.3, and what to write now
-_RENAMED = {"loss": "it is objective now, with the same values"}
+_RENAMED = {
+    "loss": "it is objective now, with the same values",
+    "densify": "it is an argument of fit now, an event of your own; 'largest-error' is in benchmarks/core/image_gs.py",
+}
+# values of version 0.3
+_VALUES_OF_IMAGE_GS = ("image-gs", "gradient", "adam")
 
 
 class FitConfig(BaseModel):
@@ -54,13 +59,10 @@ class FitConfig(BaseModel):
     backend: str = Field("auto", description="kernel, as in region_splat")
 
     # The Gaussians
-    initializer: Literal["uniform", "random", "gradient"] = Field(
+    initializer: Literal["uniform", "random"] = Field(
         "uniform",
         description="where the first centres are; uniform: anywhere, with the image's colours; random: anywhere, with "
-        "random colours; gradient: where the image changes, as Image-GS",
-    )
-    densify: Literal["matching-pursuit", "largest-error"] = Field(
-        "matching-pursuit", description="where Gaussians are added; largest-error: as Image-GS"
+        "random colours",
     )
     densify_from: float = Field(0.01, gt=0.0, le=1.0, description="fraction of N at the start; the rest is added later")
     warmup: bool = Field(
@@ -82,14 +84,13 @@ class FitConfig(BaseModel):
     # The descent
     objective: ObjectiveName | None = Field(
         None,
-        description="what is lowered: l2, the squared error; l1; ms-ssim, what MS-SSIM lacks; l1+ssim: L1 + "
-        "0.1 (1 - SSIM), as Image-GS. None: l2, for a file of a size or quality ms-ssim. Files and videos take l2 and "
-        "ms-ssim",
+        description="what is lowered: l2, the squared error; l1; ms-ssim, what MS-SSIM lacks. None: l2, for a file of "
+        "a size or quality ms-ssim. Files and videos take l2 and ms-ssim",
     )
-    optimizer: Literal["gaussian-adam", "adan", "adam"] = Field(
+    optimizer: Literal["gaussian-adam", "adan"] = Field(
         "gaussian-adam",
-        description="gaussian-adam: Adam in each Gaussian's own frame; adan: as GaussianImage; adam: as Image-GS; each "
-        "has its own parameters and learning rates",
+        description="gaussian-adam: Adam in each Gaussian's own frame; adan: as GaussianImage; each has its own "
+        "parameters and learning rates",
     )
     learning_rate_factor: float = Field(1.0, gt=0.0, description="factor on all learning rates of the optimizer")
     min_sigma: float = Field(
@@ -168,7 +169,7 @@ class FitConfig(BaseModel):
         elif not isinstance(recipe, str):
             raise InvalidArgumentType("recipe", "a name or a FitConfig", type(recipe).__name__)
         elif recipe not in available_recipes():
-            raise InvalidArgument("recipe", f"one of {', '.join(available_recipes())}", repr(recipe))
+            raise InvalidArgument("recipe", f"one of {', '.join(available_recipes())}", _shown(recipe))
         else:
             values = tomllib.loads((files("kcgs.recipes") / f"{recipe}.toml").read_text(encoding="utf-8"))
         return cls(**{**values, **settings})
@@ -197,4 +198,10 @@ def _first(error: ValidationError) -> Exception:
     if detail["type"] == "value_error":
         return cast(Exception, detail["ctx"]["error"])
     expected = detail["msg"].removeprefix("Input should be ")
-    return InvalidArgument(name, expected, repr(detail["input"]))
+    return InvalidArgument(name, expected, _shown(detail["input"]))
+
+
+def _shown(value: object) -> str:
+    """Return a value as a message shows it, with where it went if it was one of Image-GS."""
+    is_moved = isinstance(value, str) and value in _VALUES_OF_IMAGE_GS
+    return repr(value) + (", which is now in benchmarks/core/image_gs.py" if is_moved else "")

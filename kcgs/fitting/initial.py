@@ -17,7 +17,7 @@ from .batch_maps import map_of_each
 from .checks import check_images_and_regions, check_num_gaussians, is_batch
 
 # sum of the weights of Gaussians of half the spacing at a pixel
-OVERLAP = math.pi / 2
+_OVERLAP = math.pi / 2
 
 
 def initial_field(
@@ -62,7 +62,7 @@ def uniform_field(images: Tensor, num_gaussians: int, regions: RegionMap | None,
     field = random_field(images, num_gaussians, regions, seed)
     x, y = field.means.detach().long().unbind(-1)
     pixels = (y * images.shape[3] + x)[:, None].expand(-1, images.shape[1], -1)
-    field.colors.data = (images.flatten(2).gather(2, pixels).mT / OVERLAP).contiguous()
+    field.colors.data = (images.flatten(2).gather(2, pixels).mT / _OVERLAP).contiguous()
     return field
 
 

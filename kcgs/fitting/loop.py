@@ -24,7 +24,6 @@ from .clock import Clock
 from .config import FitConfig
 from .events import HandleDivergence, Log, OnStep, Report
 from .finish import finish
-from .optimizers import optimizer_kind
 from .problem import Problem, make_problem
 from .result import FitResult
 from .schedule import make_schedule
@@ -32,7 +31,7 @@ from .search import search
 from .start import start
 from .state import FitState
 from .steppers import Stepper, make_stepper
-from .user_objects import Densifier, split_names
+from .user_objects import Densifier, Initializer, split_names
 
 
 @torch.inference_mode(False)
@@ -44,7 +43,8 @@ def fit(
     *,
     recipe: str | FitConfig = "best",
     objective: str | Loss | None = None,
-    densify: str | Densifier | None = None,
+    initializer: str | Initializer | None = None,
+    densify: Densifier | None = None,
     optimizer: str | Callable[[GaussianField], Any] | None = None,
     seed: int = 0,
     on_step: OnStep | None = None,
@@ -86,11 +86,15 @@ def fit(
         recipe: a name from :func:`available_recipes`, or settings.
         objective: what is lowered, by a name of :class:`FitConfig`; or a loss of your own, a function from a render,
             :math:`(1, C, H, W)`, not clipped, to a scalar, through which autograd goes. None: the recipe's, else l2.
-        densify: where Gaussians are added, by a name of :class:`FitConfig`; or an event of your own: an object with
-            ``act(state)``, called before every step, and ``end``, the share of the fit at its last addition. None: the
-            recipe's.
+        initializer: the first Gaussians, by a name of :class:`FitConfig`; or a function with the arguments of
+            :func:`kcgs.fitting.initial_field`: the images, :math:`(B, C, H, W)`, or grey ones without an image; how
+            many Gaussians to begin with; a RegionMap or None; and the seed. It returns a GaussianField with this batch
+            size, and with region ids where there is a map. None: the recipe's.
+        densify: an event of your own that adds Gaussians: an object with ``act(state)``, called before every step, and
+            ``end``, the share of the fit at its last addition. None: matching pursuit.
         optimizer: a name of :class:`FitConfig`, or a function from a field to an optimizer with the methods of
-            :class:`kcgs.optim.GaussianAdam`. None: the recipe's.
+            :class:`kcgs.optim.GaussianAdam`, and its members ``rate``, ``has_drafts`` and ``keeps_averages``, such as a
+            :class:`kcgs.optim.ReparametrizedOptimizer`. None: the recipe's.
         seed: of the random start.
         on_step: called after every iteration with its number (from 1) and the last history entry; returning True
             stops the fit.
@@ -111,8 +115,8 @@ def fit(
         ValueError: an image that is not finite or not in [0, 1], regions of another size, N below 1 or
             above the number of pixels, unknown recipe or setting, a checkpoint that is damaged or of another fit, or
             one of a fit with functions of your own, which no file keeps; no image and no size; a loss that is no scalar
-            or does not depend on the render; several images with `target_psnr`, a checkpoint or a loss of your own, or
-            more than fit into memory.
+            or does not depend on the render; first Gaussians of another number or size; an optimizer that lacks a
+            member; several images with `target_psnr`, a checkpoint or a loss of your own, or more than fit into memory.
         OSError: a checkpoint that cannot be written; raised before the fit.
 
     Example:
@@ -125,7 +129,7 @@ def fit(
         >>> len(batch.scene), batch.scene.render().shape, batch.psnr.shape
         (4, torch.Size([4, 3, 16, 24]), torch.Size([4]))
     """
-    named, objects = split_names(objective=objective, densify=densify, optimizer=optimizer)
+    named, objects = split_names(objective=objective, initializer=initializer, densify=densify, optimizer=optimizer)
     config = FitConfig.from_recipe(recipe, **named, **settings)
     problem = make_problem(image, regions, num_gaussians, config, seed, objects, size=size, channels=channels)
     if resume and checkpoint is None:
@@ -202,7 +206,7 @@ def _run(
     report = Report(stepper, clock, bar, on_step, store)
     schedule, log = make_schedule(state.problem), Log(stepper, clock)
     events: list[Event] = [report, end, HandleDivergence(stepper), *schedule, log]
-    reason = run(state, stepper.step, progress, events, optimizer_kind(state.problem).rate)
+    reason = run(state, stepper.step, progress, events, state.optimizer.rate)
     stepper.poll(wait=True)
     return finish(state, reason, clock)
 

@@ -19,10 +19,8 @@ from kcgs.optim import OBJECTIVES, ImageObjective, LossObjective, MsSsim, Object
 from .batch_maps import regions_per_map
 from .checks import check_images_and_regions, check_num_gaussians, is_batch, regions_of
 from .config import FitConfig
-from .published.ssim_loss import AbsoluteAndSsim
 from .user_objects import NO_OBJECTS, UserObjects
 
-_OBJECTIVES: dict[str, type[ImageObjective]] = {**OBJECTIVES, "l1+ssim": AbsoluteAndSsim}
 # of every value, where there is no image
 _GREY = 0.5
 # peak memory of a fit: bytes per pixel, per value of an image, and per Gaussian, measured
@@ -125,7 +123,7 @@ class Problem:
     def make_objective(self, image: Tensor) -> ImageObjective:
         """Return the objective of the settings for an image, (..., C, H, W)."""
         assert self.config.objective is not None
-        kind = _OBJECTIVES[self.config.objective]
+        kind = OBJECTIVES[self.config.objective]
         return MsSsim(image, self.reduction) if kind is MsSsim else kind(image)
 
 

@@ -6,16 +6,13 @@ from kcgs.optim import Event
 
 from .events import AdaptContours, Densify, EndDrafts, SettleContours
 from .problem import Problem
-from .published.largest_error import DensifyAtLargestError
 from .published.warmup import Warmup
-
-_DENSIFIERS = {"matching-pursuit": Densify, "largest-error": DensifyAtLargestError}
 
 
 def make_schedule(problem: Problem) -> list[Event]:
     """Return the events, in the order in which they act."""
     config, contours = problem.config, AdaptContours() if problem.config.move_contours else None
-    densify = problem.objects.densify or _DENSIFIERS[config.densify](contours)
+    densify = problem.objects.densify or Densify(contours)
     events: list[Event] = [EndDrafts()]
     if config.warmup:
         events.append(Warmup())

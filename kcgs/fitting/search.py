@@ -17,7 +17,6 @@ import torch
 from kcgs.functional import psnr
 
 from .clock import Clock
-from .optimizers import optimizer_kind
 from .problem import Problem
 from .pursuit import add_gaussians
 from .removal import remove_gaussians
@@ -90,7 +89,7 @@ def _fit(problem: Problem, count: int, trials: list[_Trial], seconds: float, run
 def _can_go_on(problem: Problem, trial: _Trial) -> bool:
     """Whether a fit may go on from a trial, whose regions are merged for its own number of Gaussians."""
     is_merged = problem.config.merge_regions and problem.num_excess_regions != trial.state.problem.num_excess_regions
-    return trial.result.stop_reason != "diverged" and optimizer_kind(problem).keeps_averages and not is_merged
+    return trial.result.stop_reason != "diverged" and trial.state.optimizer.keeps_averages and not is_merged
 
 
 def _warm_start(problem: Problem, finished: FitState) -> FitState:

@@ -15,12 +15,12 @@ from kcgs.optim import Renderer, draft_cutoff
 
 from .batch_maps import join_maps, map_of_each, regions_per_map
 from .initial import initial_sigma, random_field, uniform_field
-from .optimizers import optimizer_kind
+from .optimizers import make_optimizer
 from .problem import Problem
-from .published.gradient_start import gradient_field
 from .state import FitState
+from .user_objects import check_initial
 
-_INITIALIZERS = {"uniform": uniform_field, "random": random_field, "gradient": gradient_field}
+_INITIALIZERS = {"uniform": uniform_field, "random": random_field}
 
 
 def start(problem: Problem) -> FitState:
@@ -40,12 +40,17 @@ def start(problem: Problem) -> FitState:
 
 def _initial_field(problem: Problem, regions: RegionMap | None, counts: list[int]) -> GaussianField:
     """Return so many Gaussians for each image; images with fewer than others have rows of the colour 0 at the end."""
-    initialize, images, most = _INITIALIZERS[problem.config.initializer], problem.canvas, max(counts)
+    initialize = problem.objects.initializer or _INITIALIZERS[problem.config.initializer]
+    images, most = problem.canvas, max(counts)
+
+    def scatter(images: Tensor, count: int, regions: RegionMap | None) -> GaussianField:
+        return check_initial(initialize(images, count, regions, problem.seed), images, count, regions)
+
     if regions is None or min(counts) == most:
-        return initialize(images, most, regions, problem.seed)
+        return scatter(images, most, regions)
     maps = map_of_each(regions, problem.num_images)
     fields = [
-        pad_rows(initialize(image[None], count, one, problem.seed)[0], most, one)
+        pad_rows(scatter(image[None], count, one)[0], most, one)
         for image, count, one in zip(images, counts, maps, strict=True)
     ]
     return GaussianField.stack(fields)
@@ -55,11 +60,11 @@ def make_state(
     problem: Problem, field: GaussianField, regions: RegionMap | None, num_initial: int, **progress: Any
 ) -> FitState:
     """Return the state of a fit of a field that began with so many Gaussians."""
-    config, kind = problem.config, optimizer_kind(problem)
-    cutoff = draft_cutoff(config.cutoff) if kind.has_drafts else config.cutoff
+    config, optimizer = problem.config, make_optimizer(problem, field, initial_sigma(problem.size, num_initial))
+    cutoff = draft_cutoff(config.cutoff) if optimizer.has_drafts else config.cutoff
     return FitState(
         field,
-        kind.make_optimizer(config, field, initial_sigma(problem.size, num_initial)),
+        optimizer,
         problem.objective,
         Renderer(problem.size, regions, cutoff, config.backend, problem.bounds),
         problem=problem,

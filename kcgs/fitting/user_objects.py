@@ -1,13 +1,20 @@
-"""What users pass in place of the names of a recipe: a loss, an event that adds Gaussians, an optimizer."""
+"""What users pass in place of the names of a recipe: a loss, first Gaussians, an event that adds some, an optimizer."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+from torch import Tensor
+
 from kcgs.errors import InvalidArgument
+from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
 from kcgs.optim import Event, Loss
+
+Initializer = Callable[[Tensor, int, RegionMap | None, int], GaussianField]
+# of an optimizer beside its methods
+_FIT_MEMBERS = ("rate", "has_drafts", "keeps_averages")
 
 
 @runtime_checkable
@@ -42,6 +49,8 @@ class UserObjects(NamedTuple):
 
     objective: Loss | None = None
     """From a render, (1, C, H, W), to a scalar."""
+    initializer: Initializer | None = None
+    """From images, (B, C, H, W), N, a map or None, and a seed to a batch of fields."""
     densify: Densifier | None = None
     optimizer: Callable[[GaussianField], Any] | None = None
     """Returns an optimizer with the methods of GaussianAdam."""
@@ -51,8 +60,10 @@ NO_OBJECTS = UserObjects()
 
 
 def split_names(**arguments: object) -> tuple[dict[str, Any], UserObjects]:
-    """Split the arguments objective, densify and optimizer into settings, by name, and objects of the user's."""
-    settings: dict[str, Any] = {name: value for name, value in arguments.items() if isinstance(value, str)}
+    """Split the arguments of a fit into settings, by name, and objects of the user's."""
+    settings: dict[str, Any] = {
+        name: value for name, value in arguments.items() if isinstance(value, str) and name != "densify"
+    }
     objects = UserObjects(**{name: value for name, value in arguments.items() if name not in settings})  # type: ignore[arg-type]
     for name, value in objects._asdict().items():
         if name != "densify" and value is not None and not callable(value):
@@ -61,7 +72,31 @@ def split_names(**arguments: object) -> tuple[dict[str, Any], UserObjects]:
     if hasattr(densify, "due"):
         raise InvalidArgument("densify", "an event without `due`, whose `act` knows when it acts", repr(densify))
     if densify is not None and not isinstance(densify, Densifier):
-        raise InvalidArgument("densify", "a name, or an event with `act` and `end`", repr(densify))
+        raise InvalidArgument("densify", "an event with `act` and `end`, or None: matching pursuit", repr(densify))
     if objects.objective is not None:  # else the recipe's
         settings["objective"] = None
     return settings, objects
+
+
+def check_initial(field: object, images: Tensor, num_gaussians: int, regions: RegionMap | None) -> GaussianField:
+    """Return what an initializer returned, if it is a field of so many Gaussians for each of the images."""
+    batch, channels, *size = images.shape
+    expected = _layout((batch, num_gaussians, channels), tuple(size), regions is not None)
+    received = type(field).__name__
+    if isinstance(field, GaussianField):
+        received = _layout(tuple(field.colors.shape), field.size, field.region_ids is not None)
+        if received == expected:
+            return field
+    raise InvalidArgument("initializer", f"a function that returns a GaussianField of {expected}", received)
+
+
+def _layout(colors: tuple[int, ...], size: tuple[int, ...], has_ids: bool) -> str:
+    return f"colors {colors}, size {size} and {'' if has_ids else 'no '}region_ids"
+
+
+def check_optimizer(optimizer: Any) -> Any:
+    """Return a user's optimizer, if it has what a fit reads from it beside its methods."""
+    if missing := [name for name in _FIT_MEMBERS if not hasattr(optimizer, name)]:
+        expected = f"a function that returns an optimizer with {', '.join(_FIT_MEMBERS)}"
+        raise InvalidArgument("optimizer", expected, f"{type(optimizer).__name__} without {', '.join(missing)}")
+    return optimizer

@@ -6,9 +6,10 @@ from .gaussian_adam import COLOR_LEARNING_RATE, LEARNING_RATE, GaussianAdam
 from .gaussians import Gaussians, Renderer, draft_cutoff
 from .ms_ssim import MsSsim
 from .newton import NewtonDescent, self_product
-from .objectives import AbsoluteError, ImageObjective, Loss, LossObjective, Objective, SquaredError
+from .objectives import ImageObjective, Loss, LossObjective, Objective, SquaredError
 from .registry import OBJECTIVES
+from .reparametrized import ReparametrizedOptimizer
 from .run import End, Event, TimedAction, cosine_decay, count_iterations, run
 
 # public; what else is imported here is for the other rooms of kcgs
-__all__ = ["GaussianAdam"]
+__all__ = ["GaussianAdam", "ReparametrizedOptimizer"]

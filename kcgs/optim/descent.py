@@ -21,7 +21,7 @@ class FieldState:
     field: GaussianField
     optimizer: Any
     """A GaussianAdam, or what has its `param_groups`, `step`, `append`, `keep`, `state_dict` and `load_state_dict`, and
-    for a batch `freeze` and `frozen_rows`."""
+    for a batch `freeze` and `frozen_rows`; in a fit also its `rate`, `has_drafts` and `keeps_averages`."""
     objective: Objective
     renderer: Renderer
     iteration: int = 0

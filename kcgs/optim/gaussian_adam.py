@@ -16,6 +16,7 @@ from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.nn import GaussianField
 
 from .adam import COLOR_RANGE, FROZEN, begin, bounds_of, check_gradients, step_groups, within_bounds
+from .run import cosine_decay
 
 # steps of place in standard deviations and of log scale, and steps of colours: found on photos, and good on all images
 LEARNING_RATE = 0.14
@@ -62,6 +63,11 @@ class GaussianAdam(Optimizer):
 
     Source: Kingma and Ba, "Adam: A Method for Stochastic Optimization", 2015, in a Gaussian's own coordinates.
     """
+
+    has_drafts = True
+    """True: most of a fit renders with a larger cutoff."""
+    keeps_averages = True
+    """True: averages stay when Gaussians are added or removed, so that a fit may go on from a finished one."""
 
     def __init__(
         self,
@@ -113,6 +119,10 @@ class GaussianAdam(Optimizer):
         for geometry, colors in zip(self.param_groups[::2], self.param_groups[1::2], strict=True):
             step_groups(self.state, geometry, colors)
         return loss
+
+    def rate(self, progress: float) -> float:
+        """Return the factor of the learning rates in a fit, by the share of it that is over: a cosine from 1 to 0.1."""
+        return cosine_decay(progress)
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """Refuse groups that are no field's: torch calls this when the optimizer is made."""

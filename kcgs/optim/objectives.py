@@ -115,7 +115,7 @@ class SquaredError(ImageObjective):
 class AbsoluteError(ImageObjective):
     """The mean absolute error."""
 
-    power: int | None = 1
+    power = 1
 
     def slope(self, render: Tensor) -> Tensor:
         """Return the sign of the difference."""

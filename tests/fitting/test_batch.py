@@ -52,7 +52,7 @@ def test_each_image_gets_the_scene_that_it_gets_alone(objective: str, channels: 
     assert_as_alone(result, images, **settings)
 
 
-@pytest.mark.parametrize("recipe", ["paper", "gaussian-image", "image-gs", "best-baseline"])
+@pytest.mark.parametrize("recipe", ["paper", "gaussian-image", "best-baseline"])
 def test_every_recipe_takes_a_batch(recipe: str) -> None:
     settings: dict[str, Any] = {"num_gaussians": 30, "recipe": recipe, "iterations": 60}
     assert_as_alone(fit(photos(), **settings), photos(), **settings)

@@ -79,7 +79,7 @@ class IdleDevice(Readback):
         return super().numbers()
 
 
-@pytest.mark.parametrize("objective", ["l1", "l2", "l1+ssim"])
+@pytest.mark.parametrize("objective", ["l1", "l2"])
 @pytest.mark.parametrize("has_maps", [False, True])
 def test_the_errors_of_a_batch_are_those_of_each_image(objective: str, has_maps: bool) -> None:
     """On a CPU bit for bit; on a device up to the order of sums, and without a wait."""
@@ -99,7 +99,7 @@ def test_the_errors_of_a_batch_are_those_of_each_image(objective: str, has_maps:
         measure_errors(problem, DeviceTensor(renders))
         before = device.num_operations, device.num_waits
         errors = measure_errors(problem, DeviceTensor(renders))
-    assert device.num_waits == before[1] and (objective == "l1+ssim" or device.num_operations < before[0] + 20)
+    assert device.num_waits == before[1] and device.num_operations < before[0] + 20
     for column, values in zip(errors, expected, strict=True):
         torch.testing.assert_close(column.content, values, check_dtype=False, equal_nan=True)
 

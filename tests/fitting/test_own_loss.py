@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcgs import RegionMap, RegionSplatRenderer, fit
+from kcgs import GaussianField, RegionMap, RegionSplatRenderer, fit
 from kcgs.fitting import initial_field, lowest_impact, propose_gaussians
 from kcgs.fitting.problem import make_problem
 from kcgs.fitting.state import FitState
@@ -91,7 +91,8 @@ class TestLoss:
                 {"objective": lambda render: render.mean() * math.nan},
                 "objective must be a number at the first Gaussians",
             ),
-            ({"densify": 3}, "densify must be a name, or an event with `act` and `end`; got 3"),
+            ({"densify": 3}, "densify must be an event with `act` and `end`, or None: matching pursuit; got 3"),
+            ({"initializer": 3}, "initializer must be a name or a function; got 3"),
         ],
     )
     def test_bad_arguments(self, change: dict[str, Any], words: str) -> None:
@@ -99,7 +100,7 @@ class TestLoss:
             fit(**{"image": image(), "num_gaussians": 5, "objective": l1, "iterations": 3, **change})
 
     def test_the_loss_of_the_history_is_the_value_of_the_objective(self) -> None:
-        for objective in ("l2", "l1", "ms-ssim", "l1+ssim"):
+        for objective in ("l2", "l1", "ms-ssim"):
             result = fit(image(), None, 40, iterations=30, objective=objective, prune=0.0)
             problem = make_problem(image(), None, 40, result.config, 0)
             value = float(problem.objective.value(result.scene().detach()[None]))
@@ -109,7 +110,7 @@ class TestLoss:
         ("objective", "words"),
         [
             (l1, "objective must be one of .*; got a function, which only kcgs.fit takes"),
-            ("l1", "objective must be (ms-ssim or l2 for a file|l2 or ms-ssim for a video); got 'l1'"),
+            ("l1", "objective must be (ms-ssim or l2 for a file of a size|l2 or ms-ssim for a video); got 'l1'"),
         ],
     )
     def test_files_and_videos_lower_what_they_can(self, objective: Any, words: str) -> None:
@@ -140,6 +141,76 @@ def test_an_event_and_an_optimizer_of_ones_own(tmp_path: Path) -> None:
     assert counts[28] == 2 and counts[-1] == 32 and result.history[-1].psnr > result.history[0].psnr + 5
     with pytest.raises(ValueError, match="checkpoint must be None with densify of your own"):
         fit(image(), LABELS, 60, checkpoint=tmp_path / "state", **settings)
+
+
+# maps of a batch with other numbers of regions
+MAPS = torch.stack([LABELS, torch.arange(1280).view(32, 40) // 160])
+
+
+@pytest.mark.parametrize("regions", [None, LABELS, MAPS])
+@pytest.mark.parametrize("num_images", [1, 2])
+def test_first_gaussians_of_ones_own(num_images: int, regions: Tensor | None) -> None:
+    images = torch.stack([image(), image().flip(1)])[:num_images]
+    maps = MAPS[:num_images] if regions is MAPS else regions
+    named, own = (fit(images, maps, 40, iterations=20, initializer=value).scene for value in (None, initial_field))
+    for name in ("means", "cholesky", "colors"):
+        assert torch.equal(getattr(own.field, name), getattr(named.field, name))
+
+
+@pytest.mark.parametrize(
+    ("field", "words"),
+    [
+        (None, "NoneType"),
+        (GaussianField.random(3, (32, 40), seed=0), r"colors \(3, 3\), size \(32, 40\) and no region_ids"),
+        (initial_field(image()[None], 3, LABELS), r"colors \(1, 3, 3\), size \(32, 40\) and region_ids"),
+    ],
+)
+def test_first_gaussians_that_do_not_fit(field: object, words: str) -> None:
+    expected = r"a GaussianField of colors \(1, 1, 3\), size \(32, 40\) and no region_ids"
+    with pytest.raises(ValueError, match=f"^initializer must be a function that returns {expected}; got {words}$"):
+        fit(image(), None, 60, initializer=lambda *arguments: field)
+
+
+class ExactAdam(GaussianAdam):
+    """Declines drafts, and keeps its rates."""
+
+    has_drafts = False
+
+    def rate(self, progress: float) -> float:
+        return 1.0
+
+
+def test_an_optimizer_that_declines_drafts() -> None:
+    cutoffs, rates = [], []
+
+    class Observe(AddAll):
+        def act(self, state: FitState) -> None:
+            cutoffs.append(state.renderer.cutoff)
+            rates.append(state.optimizer.param_groups[0]["lr"])
+
+    for optimizer in (ExactAdam, GaussianAdam):
+        fit(image(), None, 20, iterations=20, densify=Observe(), optimizer=optimizer)
+    assert set(cutoffs[:20]) == {1e-4} and set(cutoffs[20:37]) == {1e-3} and set(cutoffs[37:]) == {1e-4}
+    assert set(rates[:20]) == {0.14} and rates[39] < 0.02
+
+
+def test_an_optimizer_that_keeps_no_averages_is_not_gone_on_with() -> None:
+    class StartsAnew(GaussianAdam):
+        keeps_averages = False
+
+    firsts = []
+    for optimizer in (GaussianAdam, StartsAnew):
+        iterations: list[int] = []
+        fit(image(), None, 60, iterations=40, target_psnr=20.0, optimizer=optimizer,
+            on_step=lambda i, e, seen=iterations: seen.append(i))  # fmt: skip
+        firsts.append([i for k, i in enumerate(iterations) if k and i <= iterations[k - 1]])
+    assert set(firsts[0]) == {25} and set(firsts[1]) == {1}
+
+
+def test_an_optimizer_without_a_rate() -> None:
+    words = "an optimizer with rate, has_drafts, keeps_averages; got Adam without rate, has_drafts, keeps_averages"
+    with pytest.raises(ValueError, match=f"^optimizer must be a function that returns {words}$"):
+        fit(image(), None, 9, optimizer=lambda field: torch.optim.Adam(field.parameters()))
 
 
 def test_an_event_that_adds_too_many_and_one_that_ends_the_fit() -> None:

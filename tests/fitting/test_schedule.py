@@ -12,7 +12,7 @@ import torch
 from kcgs import FitConfig, RegionMap
 from kcgs.fitting.contour_moves import accept_moves
 from kcgs.fitting.events import Densify, SettleContours
-from kcgs.fitting.optimizers import optimizer_kind
+from kcgs.fitting.optimizers import make_optimizer
 from kcgs.fitting.problem import make_problem
 from kcgs.fitting.result import HistoryEntry
 from kcgs.fitting.schedule import make_schedule
@@ -74,9 +74,9 @@ class TestDensify:
 class TestLearningRates:
     def rates(self, progress: float, factor: float = 1.0, iterations: int = 12_500, **settings: Any) -> list[float]:
         config = FitConfig(learning_rate_factor=factor, iterations=iterations, **settings)
-        method = optimizer_kind(make_problem(torch.rand(1, 8, 8), None, 3, config, 0))
-        optimizer = method.make_optimizer(config, GaussianField.random(3, (8, 8), seed=0), 2.0)
-        return [float(group["lr"]) * method.rate(progress) for group in optimizer.param_groups]
+        problem = make_problem(torch.rand(1, 8, 8), None, 3, config, 0)
+        optimizer = make_optimizer(problem, GaussianField.random(3, (8, 8), seed=0), 2.0)
+        return [float(group["lr"]) * optimizer.rate(progress) for group in optimizer.param_groups]
 
     def test_ours_fall_to_a_tenth(self) -> None:
         geometry, colors = zip(*(self.rates(p / 10) for p in range(11)), strict=True)
@@ -89,10 +89,7 @@ class TestLearningRates:
         assert rates == [[f * 2e-3, f * 4e-3, f * 2e-3] for f in (1, 1, 0.5, 0.25, 0.25)]
         assert self.rates(0.0, iterations=1, optimizer="adan") == [2e-2, 4e-2, 2e-2]
 
-    def test_those_of_image_gs_stay(self) -> None:
-        assert self.rates(0.0, optimizer="adam") == self.rates(1.0, optimizer="adam")
-
-    @pytest.mark.parametrize("optimizer", ["gaussian-adam", "adan", "adam"])
+    @pytest.mark.parametrize("optimizer", ["gaussian-adam", "adan"])
     def test_the_factor_scales_all(self, optimizer: str) -> None:
         once, thrice = (self.rates(0.5, factor, optimizer=optimizer) for factor in (1.0, 3.0))
         assert thrice == pytest.approx([3 * rate for rate in once])
@@ -104,7 +101,6 @@ class TestEvents:
         [
             ({}, ["EndDrafts", "Densify", "SettleContours"]),
             ({"warmup": True, "move_contours": False}, ["EndDrafts", "Warmup", "Densify"]),
-            ({"densify": "largest-error", "move_contours": False}, ["EndDrafts", "DensifyAtLargestError"]),
         ],
     )
     def test_are_those_of_the_settings(self, settings: dict[str, Any], names: list[str]) -> None:

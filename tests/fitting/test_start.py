@@ -12,8 +12,7 @@ from torch import Tensor
 from kcgs import RegionMap
 from kcgs.fitting import FitConfig, initial_field, make_problem
 from kcgs.fitting.initial import random_field
-from kcgs.fitting.published.gradient_start import gradient_field
-from kcgs.functional import lookup_regions, region_splat
+from kcgs.functional import lookup_regions
 from kcgs.nn import GaussianField
 
 
@@ -21,7 +20,7 @@ def of_one_image(start: Callable[..., GaussianField]) -> Callable[..., GaussianF
     return lambda image, *arguments: start(image[None], *arguments)[0]
 
 
-START = {"gradient": of_one_image(gradient_field), "random": of_one_image(random_field), "uniform": initial_field}
+START = {"random": of_one_image(random_field), "uniform": initial_field}
 
 
 def scene(size: tuple[int, int] = (48, 64), channels: int = 3) -> tuple[Tensor, Tensor]:
@@ -33,10 +32,6 @@ def scene(size: tuple[int, int] = (48, 64), channels: int = 3) -> tuple[Tensor, 
     phases = torch.arange(channels)[:, None, None]
     image = 0.5 + 0.2 * torch.sin(x * 0.9 + phases) * (x < size[1] // 2) + 0.02 * labels
     return image.clamp(0, 1), labels
-
-
-def draw(field: GaussianField, regions: RegionMap | None) -> Tensor:
-    return region_splat(field.means, field.cholesky, field.colors, field.region_ids, regions, size=field.size).detach()
 
 
 @pytest.mark.parametrize("name", START)
@@ -77,22 +72,6 @@ class TestEvery:
         with torch.no_grad():
             field = START[name](image, 10, RegionMap.from_labels(labels), 0)
         assert all(p.requires_grad and p.is_leaf for p in field.parameters())
-
-
-class TestGradient:
-    def test_centres_follow_the_detail(self) -> None:
-        field = START["gradient"](scene()[0], 200, None, 0)
-        share = float((field.means[:, 0] < 32).float().mean())
-        assert share > 0.7
-
-    def test_flat_image_is_covered_evenly_at_its_level(self) -> None:
-        image = torch.full((1, 60, 60), 0.4)
-        field = START["gradient"](image, 200, None, 0)
-        assert float((field.means[:, 0] < 30).float().mean()) == pytest.approx(0.5, abs=0.1)
-        assert float(draw(field, None)[:, 10:-10, 10:-10].mean()) == pytest.approx(0.4, rel=0.15)
-
-    def test_no_pixel_twice(self) -> None:
-        assert len(START["gradient"](scene()[0], 1000, None, 0).means.floor().unique(dim=0)) == 1000
 
 
 class TestInitialField:

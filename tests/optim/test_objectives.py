@@ -8,8 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcgs.fitting.published.ssim_loss import AbsoluteAndSsim
-from kcgs.optim import AbsoluteError, ImageObjective, LossObjective, Objective, SquaredError
+from kcgs.optim.objectives import AbsoluteError, ImageObjective, LossObjective, Objective, SquaredError
 
 IMAGE = torch.rand(3, 24, 40, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 RENDER = 0.8 * IMAGE + 0.1 + 0.05 * torch.rand(3, 24, 40, generator=torch.Generator().manual_seed(1)).double()
@@ -33,7 +32,6 @@ def autograd(objective: Objective) -> Tensor:
         (SquaredError(IMAGE), 0.5),
         (SquaredError(IMAGE, WEIGHT), 0.5),
         (AbsoluteError(IMAGE), 1.0),
-        (AbsoluteAndSsim(IMAGE), 1.0),
         (LossObjective(mean_fourth_power), 1.0),
     ],
     ids=lambda value: type(value).__name__ if isinstance(value, Objective) else str(value),
@@ -47,10 +45,10 @@ def test_values_with_a_power_are_means_of_it(kind: type[SquaredError | AbsoluteE
     objective = kind(IMAGE)
     assert objective.power == power
     torch.testing.assert_close(objective.value(RENDER), (RENDER - IMAGE).abs().pow(power).mean())
-    assert SquaredError(IMAGE, WEIGHT).power is None and AbsoluteAndSsim(IMAGE).power is None
+    assert SquaredError(IMAGE, WEIGHT).power is None
 
 
-@pytest.mark.parametrize("kind", [SquaredError, AbsoluteError, AbsoluteAndSsim])
+@pytest.mark.parametrize("kind", [SquaredError, AbsoluteError])
 def test_a_batch_is_as_each_image_alone(kind: type[ImageObjective]) -> None:
     images, renders = torch.stack([IMAGE, IMAGE.flip(1)]).float(), torch.stack([RENDER, 1 - RENDER]).float()
     batch = kind(images)

@@ -1,1 +1,1 @@
-"""Published methods, as objectives, optimizers, starts and events like a user's own."""
+"""Parts of published methods: GaussianImage's optimizer, and the warm-up of the paper."""

@@ -8,15 +8,17 @@ import torch
 from torch import Tensor
 
 from kcgs.nn import GaussianField
+from kcgs.optim import ReparametrizedOptimizer
 
 from .adan import Adan
-from .reparametrized import MIN_SIGMA, PublishedOptimizer
 
 # tanh reaches it
 _EDGE = 1.0 - 1e-6
+# pixels: thinner Gaussians fall between the pixel centres
+_MIN_SIGMA = 0.1
 
 
-class GaussianImageAdan(PublishedOptimizer):
+class GaussianImageAdan(ReparametrizedOptimizer):
     """Adan on centres through tanh, and on Cholesky factors and colours as they are.
 
     The learning rate, 1e-3, is that of 50,000 iterations; a shorter fit takes larger steps, by the root of the ratio,
@@ -37,12 +39,14 @@ class GaussianImageAdan(PublishedOptimizer):
     def __init__(self, field: GaussianField, sigma: float, iterations: int, rate_factor: float) -> None:
         speedup = min(self.max_rate_factor, math.sqrt(max(1.0, self.full_iterations / iterations)))
         rate = self.learning_rate * speedup * rate_factor
-        super().__init__(field, [rate, rate * sigma, rate], Adan, self.max_sigma)
+        height, width = field.size
+        self.extent = field.means.detach().new_tensor([width, height])
+        self.limit = self.max_sigma * math.hypot(height, width)
+        super().__init__(field, [rate, rate * sigma, rate], Adan)
 
-    @classmethod
-    def rate(cls, progress: float) -> float:
+    def rate(self, progress: float) -> float:
         """Return the factor of the learning rates."""
-        return 0.5 ** int(progress / cls.half_life)
+        return 0.5 ** int(progress / self.half_life)
 
     def encode(self, field: GaussianField) -> list[Tensor]:
         """Return the centres before tanh, factors and colours."""
@@ -59,9 +63,9 @@ class GaussianImageAdan(PublishedOptimizer):
         l11, l21, l22 = factors.unbind(-1)
         cholesky = torch.stack(
             [
-                l11.abs().clamp(MIN_SIGMA, self.limit),
+                l11.abs().clamp(_MIN_SIGMA, self.limit),
                 torch.where(l11 < 0, -l21, l21).clamp(-self.limit, self.limit),
-                l22.abs().clamp(MIN_SIGMA, self.limit),
+                l22.abs().clamp(_MIN_SIGMA, self.limit),
             ],
             -1,
         )

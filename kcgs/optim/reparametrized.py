@@ -1,8 +1,7 @@
-"""A torch optimizer on the parameters of a published method."""
+"""A torch optimizer on other parameters than those of a field."""
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -12,41 +11,68 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 from torch.optim import Optimizer
 
+from kcgs.errors import InvalidArgument
 from kcgs.nn import GaussianField
 
-# pixels: thinner Gaussians fall between the pixel centres
-MIN_SIGMA = 0.1
 
+class ReparametrizedOptimizer(ABC):
+    """A torch optimizer that moves parameters of its own, and writes the Gaussians that they stand for into a field.
 
-class PublishedOptimizer(ABC):
-    """A torch optimizer that moves its own parameters of Gaussians, and shows them in a field.
+    Convention: a subclass has `encode`, from a field to parameters, and `decode`, from parameters to Gaussians. A step
+    takes the gradients of the field back to the parameters. The last parameter is the colours as they are, which share
+    their memory with the field's: a fit writes into them. It has the methods of :class:`kcgs.optim.GaussianAdam` that a
+    fit calls. When Gaussians are added, removed or frozen, the averages of all start anew.
 
-    It has the methods of :class:`kcgs.optim.GaussianAdam` that a fit calls. A step takes the field's
-    gradients back to the parameters. When Gaussians are added or removed, the averages of all start anew. Colours are
-    parameters as they are, and share their memory with the field's.
+    Args:
+        field: of an image or a batch; it gets new parameters.
+        rates: the learning rate of each parameter, in the order of `encode`.
+        make: from parameter groups to a torch optimizer, such as ``torch.optim.Adam``.
+
+    Raises:
+        ValueError: a field with opacities.
+
+    Example:
+        >>> from kcgs import fit
+        >>> class RoundAdam(ReparametrizedOptimizer):
+        ...     "Adam on centres, log standard deviations and colours of round Gaussians."
+        ...     def encode(self, field):
+        ...         return [field.means, field.cholesky[..., :1].log(), field.colors]
+        ...     def decode(self):
+        ...         means, log_sigma, colors = self.parameters
+        ...         sigma = log_sigma.exp()
+        ...         return means, torch.cat([sigma, 0 * sigma, sigma], -1), colors
+        >>> image = torch.linspace(0, 1, 24).expand(3, 16, 24)
+        >>> optimizer = lambda field: RoundAdam(field, [0.1, 0.05, 0.02], torch.optim.Adam)
+        >>> result = fit(image, num_gaussians=20, iterations=100, optimizer=optimizer)
+        >>> result.psnr > 25, bool((result.scene.field.cholesky[:, 1] == 0).all())
+        (True, True)
     """
 
+    has_drafts = False
+    """True: most of a fit renders with a larger cutoff."""
+    keeps_averages = False
+    """False: the averages start anew when Gaussians are added or removed, so no fit goes on from a finished one."""
+
     def __init__(
-        self,
-        field: GaussianField,
-        rates: Sequence[float],
-        make: Callable[..., Optimizer],
-        max_sigma: float = 1.0,
+        self, field: GaussianField, rates: Sequence[float], make: Callable[[list[dict[str, Any]]], Optimizer]
     ) -> None:
-        height, width = field.size
+        if field.opacities is not None:
+            raise InvalidArgument("field", "without opacities", "a field with opacities")
         self.field, self.rates, self.make = field, rates, make
-        self.limit = max_sigma * math.hypot(height, width)
         self.frozen: Tensor | None = None  # [..., N, 1]
-        self.extent = field.means.detach().new_tensor([width, height])
         self._set(self.encode(field))
 
     @abstractmethod
     def encode(self, field: GaussianField) -> list[Tensor]:
-        """Return the parameters of a field's Gaussians, (..., N, K); the colours as they are come last."""
+        """Return the parameters of a field's Gaussians, each :math:`(..., N, K)`; the colours as they are come last."""
 
     @abstractmethod
     def decode(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return means, cholesky and colors of the parameters, with their graph."""
+        """Return means, cholesky and colors of `self.parameters`, with their graph."""
+
+    def rate(self, progress: float) -> float:
+        """Return the factor of the learning rates, by the share of a fit that is over: they are constant."""
+        return 1.0
 
     @property
     def param_groups(self) -> list[dict[str, Any]]:
@@ -75,10 +101,10 @@ class PublishedOptimizer(ABC):
         if self.frozen is not None:
             self.frozen = pad(self.frozen, (0, 0, 0, added.num_gaussians))
         pairs = zip(self.parameters, self.encode(added), strict=True)
-        self._set([torch.cat([old.detach(), new], -2) for old, new in pairs])
+        self._set([torch.cat([old.detach(), new.detach()], -2) for old, new in pairs])
 
     def keep(self, field: GaussianField, mask: Tensor) -> None:
-        """Remove all Gaussians but those of a mask, (..., N)."""
+        """Remove all Gaussians but those of a mask, :math:`(..., N)`."""
 
         def select(table: Tensor) -> Tensor:
             return table[mask].view(*mask.shape[:-1], -1, table.shape[-1])
@@ -90,12 +116,12 @@ class PublishedOptimizer(ABC):
         self._set([select(old.detach()) for old in self.parameters])
 
     def freeze(self, field: GaussianField, mask: Tensor) -> None:
-        """Leave Gaussians of a mask, (..., N), as they are from here on; the averages of all start anew."""
+        """Leave Gaussians of a mask, :math:`(..., N)`, as they are from here on."""
         self.frozen = mask[..., None] if self.frozen is None else self.frozen | mask[..., None]
         self._set(self.encode(field))
 
     def frozen_rows(self, field: GaussianField) -> Tensor:
-        """Return the mask of the Gaussians that `freeze` has frozen, (..., N)."""
+        """Return the mask of the Gaussians that `freeze` has frozen, :math:`(..., N)`."""
         none = torch.zeros_like(field.means[..., 0], dtype=torch.bool)
         return none if self.frozen is None else self.frozen[..., 0]
 
