@@ -90,7 +90,7 @@ def store_entries(g: Graph, plan: DecoderPlan, visible: Value | None) -> Storage
 
 
 def _list_gaussians(g: Graph, plan: DecoderPlan, slots: Slots, tile: Value, count: int) -> tuple[Value, Value]:
-    """Which Gaussian each of `count` entries is, (P,), and 1, or 0 where it only fills a list up, (P, 1)."""
+    """Return the Gaussian of each of `count` entries, (P,), and a mask, (P, 1): 0 for entries that fill a list up."""
     lengths = pack_integers(g, np.concatenate([group.lengths for group in plan.groups]))
     longest = pack_runs(g, np.concatenate([np.full(len(group.tiles), group.longest) for group in plan.groups]))
     firsts, begins = (g.CumSum(n, 0, exclusive=1) for n in (lengths, longest))
@@ -102,10 +102,9 @@ def _list_gaussians(g: Graph, plan: DecoderPlan, slots: Slots, tile: Value, coun
 
 
 def _sorted_pairs(g: Graph, plan: DecoderPlan, slots: Slots) -> Value:
-    """Which Gaussian each pair of Gaussian and tile is of, sorted by the tile's rank, then by Gaussian.
+    """Return the Gaussians of all pairs of Gaussian and tile, sorted by the tile's rank, then by Gaussian.
 
-    They are stored the other way, Gaussian by Gaussian: its first tile, and how many tiles lie between one and the
-    next, which is mostly none.
+    The file stores pairs sorted by Gaussian: the first tile of each, and the gaps between its tiles, mostly 0.
     """
     gaussian, tile = plan.pairs
     is_first = np.diff(gaussian, prepend=-1) > 0
