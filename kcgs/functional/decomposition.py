@@ -11,16 +11,14 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from kcgs.kernels import least_exponent, support_radius
+from kcgs.kernels import least_exponent, least_whitened, support_radius, whiten
 
 from .arguments import SplatArguments
 from .map_windows import MapWindows
 
 _SIDE = 32  # pixels of a tile
-_HALF = (_SIDE - 1) / 2  # pixels from the middle of a tile to its outermost pixel centres
 _CHUNK = 64  # Gaussians evaluated at once
 _FRAME = 5  # numbers of a Gaussian before its colour: mean x, mean y, 1 / l11, l21 / l11, 1 / l22
-_SLACK = 1.001  # factor on the support, so that rounding drops no Gaussian that has a weight
 
 
 class _TileGaussians(NamedTuple):
@@ -82,11 +80,9 @@ def decompose(*operands: Any) -> Tensor:
 def _mark_near(columns: Tensor, middle: Tensor, cutoff: float) -> Tensor:
     """Mark the Gaussians whose support reaches a tile, [N + 1]; not the last, which is no Gaussian."""
     x, y, inverse1, slope, inverse2 = columns.unbind()
-    radius = support_radius(cutoff, x.dtype) * _SLACK
-    # z at the middle of the tile, against how far it goes from there to the farthest pixel
-    z1, z2 = (middle[0] - x) * inverse1, (middle[1] - y - slope * (middle[0] - x)) * inverse2
-    near = (z1.abs() <= inverse1 * _HALF + radius) & (z2.abs() <= (slope.abs() + 1) * inverse2 * _HALF + radius)
-    return near & (inverse1 > 0)
+    radius = support_radius(cutoff, x.dtype)
+    z1, z2 = least_whitened(middle[0] - x, middle[1] - y, inverse1, slope, inverse2, _SIDE / 2)
+    return (z1 <= radius) & (z2 <= radius) & (inverse1 > 0)
 
 
 def _sum_regions(
@@ -138,12 +134,12 @@ def _sum_gaussians(near: Tensor, gaussians: _TileGaussians, black: Tensor, cutof
 
 def _weights(frame: Tensor, middle: Tensor, cutoff: float) -> Tensor:
     """Evaluate the weights of K Gaussians at the pixels of a tile, [K, pixels]."""
-    offsets = torch.arange(_SIDE, device=frame.device, dtype=frame.dtype) - _HALF
+    offsets = torch.arange(_SIDE, device=frame.device, dtype=frame.dtype) - (_SIDE - 1) / 2
     mean_x, mean_y, inverse1, slope, inverse2 = (v[:, None, None] for v in frame.unbind(1))
     # pixel minus mean before anything is multiplied: nothing cancels where a Gaussian is far below a pixel wide
     x = (middle[0] - mean_x) + offsets  # [K, 1, side]
     y = (middle[1] - mean_y) + offsets[:, None]  # [K, side, 1]
-    z1, z2 = x * inverse1, (y - slope * x) * inverse2
+    z1, z2 = whiten(x, y, inverse1, slope, inverse2)
     weight = ((z1 * z1 + z2 * z2) * -0.5).clamp_min(least_exponent(0.0, frame.dtype)).exp()
     if cutoff > 0.0:
         weight = torch.where(weight >= cutoff, weight, 0.0)

@@ -16,11 +16,21 @@ from .cuda.capacity import settle, without_waiting
 from .interface import Kernel, SplatInputs, with_autograd
 from .registry import BACKENDS, check_backend, resolve, takes_triton, warm_up
 from .tiles import bounding_tiles, find_keys
-from .whitened import MEAN_LIMIT, SCALE_LIMITS, SCALE_TOLERANCE, Z_LIMIT, least_exponent, support_radius
+from .whitened import (
+    MEAN_LIMIT,
+    SCALE_LIMITS,
+    SCALE_TOLERANCE,
+    Z_LIMIT,
+    affine_coefficients,
+    least_exponent,
+    least_whitened,
+    support_radius,
+    whiten,
+)
 
 __all__ = [
     "BACKENDS", "MEAN_LIMIT", "SCALE_LIMITS", "SCALE_TOLERANCE", "Z_LIMIT", "Blocks", "Coarsened", "Kernel",
-    "SplatInputs", "bounding_tiles", "check_backend", "choose_levels", "coarsen", "find_keys", "least_exponent",
-    "make_blocks", "max_spacing", "resolve", "settle", "support_radius", "takes_triton", "warm_up", "with_autograd",
-    "without_waiting",
+    "SplatInputs", "affine_coefficients", "bounding_tiles", "check_backend", "choose_levels", "coarsen", "find_keys",
+    "least_exponent", "least_whitened", "make_blocks", "max_spacing", "resolve", "settle", "support_radius",
+    "takes_triton", "warm_up", "whiten", "with_autograd", "without_waiting",
 ]  # fmt: skip

@@ -10,7 +10,7 @@ from torch import Tensor
 from kcgs.maps import TILE
 
 from .interface import SplatInputs
-from .whitened import Z_LIMIT
+from .whitened import Z_LIMIT, affine_coefficients, least_shear
 
 # by which bounds of a support exceed it, so that they hold for weights in float32: a share, and pixels
 RELATIVE_MARGIN = 1e-5
@@ -70,11 +70,10 @@ def bounding_tiles(
 
 def reaches(origin: Tensor, cholesky: Tensor, radius: float) -> Tensor:
     """Tell which tiles of a bounding box the support itself may touch."""
-    # the bounding box bounds z1; a slanted needle is thin in z2, whose least value over the tile is this
+    # the bounding box bounds z1
     l11, l21, l22 = cholesky.unbind(-1)
-    slope = l21 / l11
-    half = (TILE - 1) / 2
-    nearest = (origin[:, 1] - slope * origin[:, 0]).abs() - half * (1 + slope.abs())
+    x, y = origin.unbind(-1)
+    nearest = least_shear(x, y, l21 / l11, (TILE - 1) / 2)
     return nearest <= radius * (1 + RELATIVE_MARGIN) * l22 + MARGIN
 
 
@@ -87,10 +86,7 @@ def find_keys(keys: Tensor, tile: Tensor, region: Tensor, num_regions: int) -> t
 
 def coefficients(origin: Tensor, cholesky: Tensor) -> Tensor:
     """Return k, (P, 5), of z1 = k0 + k1 x, z2 = k2 + k3 x + k4 y in pixels from the tile's centre, in float64."""
-    l11, l21, l22 = cholesky.unbind(-1)
-    x, y = origin.unbind(-1)
-    slope = l21 / l11
-    rows = torch.stack([x / l11, 1 / l11, (y - slope * x) / l22, -slope / l22, 1 / l22], -1)
+    rows = torch.stack(affine_coefficients(*origin.unbind(-1), *cholesky.unbind(-1)), -1)
     return rows.clamp(-Z_LIMIT, Z_LIMIT)
 
 

@@ -1,6 +1,6 @@
 """Whitened coordinates z = L^-1 (p - mu) by forward substitution, and gradients from their moments.
 
-All kernels, the public checks and the ONNX decoders share these limits; docs/performance.md has the formulas.
+All kernels, the public checks and the ONNX graphs share these limits; docs/performance.md has the formulas.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ import math
 import numpy as np
 import torch
 from torch import Tensor
+
+from kcgs._arithmetic import Numbers
 
 from .interface import Gradients
 
@@ -40,6 +42,36 @@ def least_exponent(cutoff: float, dtype: torch.dtype) -> float:
 def support_radius(cutoff: float, dtype: torch.dtype) -> float:
     """Return the largest |z| at which a weight reaches `cutoff`, or, at cutoff 0, is not zero in the dtype."""
     return math.sqrt(max(-2.0 * least_exponent(cutoff, dtype), 0.0))
+
+
+def whiten(x: Numbers, y: Numbers, k1: Numbers, slope: Numbers, k2: Numbers) -> tuple[Numbers, Numbers]:
+    """Return z1 and z2 at offsets from the mean; k1, slope and k2 are 1 / l11, l21 / l11 and 1 / l22."""
+    return x * k1, (y - slope * x) * k2
+
+
+def affine_coefficients(
+    x: Numbers, y: Numbers, l11: Numbers, l21: Numbers, l22: Numbers
+) -> tuple[Numbers, Numbers, Numbers, Numbers, Numbers]:
+    """Return k of z1 = k0 + k1 u, z2 = k2 + k3 u + k4 v, for pixels at (u, v) from a point at (x, y) from the mean."""
+    slope = l21 / l11
+    k0, k1, k4 = x / l11, l11.reciprocal(), l22.reciprocal()
+    k2 = (y - slope * x) / l22
+    return k0, k1, k2, -(slope / l22), k4
+
+
+def least_shear(x: Numbers, y: Numbers, slope: Numbers, half: float) -> Numbers:
+    """Return the least |y - slope x| over a square, from its middle; below 0 where the square has points of both signs.
+
+    A slanted needle is thin in z2: few of the squares that its bounding box touches come close.
+    """
+    return (y - slope * x).abs() - (slope.abs() + 1) * half
+
+
+def least_whitened(
+    x: Numbers, y: Numbers, k1: Numbers, slope: Numbers, k2: Numbers, half: float
+) -> tuple[Numbers, Numbers]:
+    """Return the least |z1| and |z2| over a square, from its middle and half its side; below 0 where both signs are."""
+    return (x.abs() - half) * k1, least_shear(x, y, slope, half) * k2
 
 
 def sums_to_gradients(sums: Tensor, channels: int, cholesky: Tensor) -> Gradients:

@@ -17,13 +17,13 @@ from .labels import (
 from .membership import Membership
 from .region_graph import Labels, RegionGraph, merge_nearest, pairs_to_merge
 from .regions import RegionMap, wrap_labels
-from .resampled import LEAST_BLUR, PIXEL, Resampled, SmoothMembership, cut_windows, find_windows, sharpness
+from .resampled import LEAST_BLUR, Resampled, SmoothMembership, cut_windows, find_windows, sharpness
 from .softness import MAX_SOFTNESS, PairSoftness, softness_from_plain, softness_to_plain
 from .table import PER_MAP, SHARED, TILE, MapTable, with_positions
 from .widths import RADIUS_SIGMAS, truncated_gaussian
 
 __all__ = [
-    "LEAST_BLUR", "MAX_SOFTNESS", "PER_MAP", "PIXEL", "RADIUS_SIGMAS", "SHARED", "TILE", "Labels", "MapTable",
+    "LEAST_BLUR", "MAX_SOFTNESS", "PER_MAP", "RADIUS_SIGMAS", "SHARED", "TILE", "Labels", "MapTable",
     "Membership", "PairSoftness", "RegionGraph", "RegionMap", "Resampled", "SmoothMembership", "antialias",
     "as_region_map", "compact", "contour_edges", "cut_windows", "derive", "edge_band", "find_windows",
     "interior_points", "lookup_regions", "membership_at", "merge_nearest", "pairs_to_merge", "pixels_under",

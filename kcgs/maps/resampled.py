@@ -12,6 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcgs._arithmetic import Numbers
+
 from .antialiasing import SmoothLabels, antialias
 from .labels import sample_labels
 from .membership import Membership
@@ -193,15 +195,16 @@ def _read(pixels: Tensor, places: Tensor, span: Sequence[int]) -> Tensor:
     return pixels[places[:, :1, None], lines[0][:, :, None], lines[1][:, None, :]]
 
 
-def contour_variance(variance: Tensor, ratio: float | Tensor) -> Tensor:
+def contour_variance(variance: Numbers, ratio: float | Numbers) -> Numbers:
     """Return the squared width, in pixels of the new size, for that in pixels of the map."""
     return (variance - PIXEL).clamp_min(0) * ratio + PIXEL
 
 
-def sharpness(variance: Tensor, ratio: float | Tensor) -> Tensor:
+def sharpness(variance: Numbers, ratio: float | Numbers) -> Numbers:
     """Evaluate the exponent e of :class:`Resampled` for squared widths in pixels of the map; `ratio` is its s."""
+    new_variance = contour_variance(variance, ratio)
     blurred = variance.clamp_min(LEAST_BLUR**2) + PIXEL  # what antialiasing and interpolation add
-    return (blurred * ratio / contour_variance(variance, ratio)).sqrt()
+    return (blurred * ratio / new_variance).sqrt()
 
 
 def _sharpen(weights: Tensor, position: Tensor, exponent: Tensor) -> Tensor:

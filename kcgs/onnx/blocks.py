@@ -1,7 +1,7 @@
-"""The image of a decoder, rendered in blocks: log w is a polynomial in the pixel.
+"""The image of a decoder, rendered in blocks of pixels.
 
-So the weights of a list of Gaussians are one matrix product with the monomials, and its colours another with the
-weights. docs/onnx.md has the whole graph.
+log w is a polynomial in the pixel. One matrix product of coefficients and monomials gives the weights of a list of
+Gaussians, and another one the colours. docs/onnx.md has the whole graph.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from .packing import pack_integers
 from .tiles import Tiles
 from .weights import monomials, weigh
 
-# what the monomials 1, x, y, xx, xy, yy at (x + a, y + b) have besides those at (x, y): place of the factor among 1, a,
-# b, aa, ab, bb, the monomial there, the monomial here, and how often
+# The monomials 1, x, y, xx, xy, yy at (x + a, y + b) are those at (x, y) plus these terms: (factor, source, target,
+# multiplicity). A factor is one of 1, a, b, aa, ab, bb; the source is a monomial at (x + a, y + b).
 _SHIFT = (
     *((k, k, 0, 1) for k in range(1, 6)),
     (1, 3, 1, 2),
@@ -32,7 +32,7 @@ _SHIFT = (
 
 
 class BlockRenderer:
-    """Renders blocks, of rows `down` and columns `across`, group by group; what groups have in common is made once."""
+    """Renders blocks group by group. Their rows are `down`, their columns `across`; all groups share the monomials."""
 
     def __init__(self, storage: Storage, down: Axis, across: Axis, cutoff: float) -> None:
         self.graph = storage.graph
@@ -47,9 +47,9 @@ class BlockRenderer:
         self.is_native = storage.graph.And(down.is_native, across.is_native)
 
     def image(self, membership: MembershipSampler | None, grids: CoarseGrids | None) -> Value:
-        """Render the image, (1, C, H, W) and pixels to spare; memberships are needed where a tile has several regions.
+        """Render the image, (1, C, H, W) with spare pixels; tiles with several regions need memberships.
 
-        All that is known of the tiles is computed at loading, if all of the scene is rendered.
+        Without a view the operators that sort tiles read constants only, and runtimes compute them at loading.
         """
         g, groups = self.graph, self.storage.plan.pixel_groups
         tile = g.Unsqueeze(self.down.tile * self.storage.plan.tiles.cols, [1]) + self.across.tile
@@ -76,7 +76,7 @@ class BlockRenderer:
         return image
 
     def _make_shifts(self) -> Value:
-        """Make what turns coefficients around a tile's centre into those around its blocks' middles, (V, Q, 6, 6)."""
+        """Make matrices (V, Q, 6, 6) that move coefficients from the centre of a tile to the middles of its blocks."""
         g = self.graph
         x, y = g.Unsqueeze(self.across.origins, [0, 2]), g.Unsqueeze(self.down.origins, [1, 3])
         basis = np.zeros((6, 6, 6), np.float32)
@@ -87,9 +87,10 @@ class BlockRenderer:
         return g.Reshape(shifts, g.Concat([-1], self.pieces, [6, 6], axis=0))
 
     def _sort(self, group: Value, count: int) -> tuple[Value, list[Value], list[Value], Value]:
-        """Sort tiles by group, (V,); return them, one to spare, groups' begins, their ends, where each is rendered.
+        """Sort tiles by group, (V,); return the order, begins and ends of groups in it, and the place of each tile.
 
-        A group without a tile renders one that the image leaves out: not every runtime takes tensors without elements.
+        A group without a tile renders one of another group, which the image leaves out: not every runtime takes empty
+        tensors. For the last group the order has one more element.
         """
         g = self.graph
         total = g.Shape(group)

@@ -10,7 +10,7 @@ import torch
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from kcgs.maps import RADIUS_SIGMAS, TILE, Membership, SmoothMembership
+from kcgs.maps import TILE, Membership, SmoothMembership, truncated_gaussian
 
 from .graph import FLOAT, Graph, Value
 from .groups import Integers
@@ -104,16 +104,13 @@ def _list_parts(tiles: Tiles, ids: Integers, width_index: Integers) -> tuple[Int
 
 
 def _kernels(g: Graph, membership: Membership) -> Value:
-    """Make the blurs of V widths from the pixels of a label window to those of a window, (V, S, side).
-
-    The taps are those of `kcgs.maps.membership`, by operators, since a file that stored them would be larger.
-    """
-    widths, radius = np.array(membership.widths), membership.radius
-    distance = np.abs(np.arange(WINDOW)[:, None] - np.arange(WINDOW + 2 * radius) + radius).astype(np.float32)
-    ends, sigma = np.ceil(RADIUS_SIGMAS * widths), np.maximum(widths, 1e-3)
-    falloff = g.Div(distance, sigma.astype(np.float32)[:, None, None])
-    kernels = g.Exp(falloff * falloff * -0.5)
-    return kernels * g.LessOrEqual(distance, ends.astype(np.float32)[:, None, None]).astype(FLOAT)
+    """Make the blurs of V widths from the pixels of a label window to those of a window, (V, S, side)."""
+    radius = membership.radius
+    # the taps of one more pixel are 0, and those of all pixels farther off
+    steps = torch.arange(radius + 2, dtype=torch.float64)
+    taps = truncated_gaussian(steps, torch.tensor(membership.widths, dtype=torch.float64)[:, None]).float().numpy()
+    distance = np.abs(np.arange(WINDOW)[:, None] - np.arange(WINDOW + 2 * radius) + radius)
+    return g.Gather(taps, pack_integers(g, distance.clip(max=radius + 1)), axis=1)
 
 
 def _pixel_windows(g: Graph, tiles: Tiles, ids: Integers, pixels: Integers, radius: int, outside: int) -> Value:

@@ -1,4 +1,4 @@
-"""`scene_decoder`: the graph of one scene. The package's docstring walks through its parts."""
+"""`scene_decoder`: the graph of one scene. The package's docstring lists its parts."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def scene_decoder(
 
     Input ``size``, int64 (2,): height and width of the image. Output ``image``, float32 :math:`(1, C, H, W)`: what
     :class:`kcgs.nn.RegionSplatRenderer` renders at that size. No operator scatters, so that it runs on WebGPU. Memory
-    and time are those of the pixels times the Gaussians on each: for parts of very large images there is ``view``.
+    and time grow with the pixels and with the Gaussians on each. For a part of a very large image there is ``view``.
 
     Args:
         scene: one scene, no batch.

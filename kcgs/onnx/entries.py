@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
-from kcgs.kernels import Z_LIMIT
+from kcgs.kernels import Z_LIMIT, affine_coefficients
 from kcgs.maps import TILE
 
 from .graph import FLOAT, Graph, Value
@@ -15,8 +14,7 @@ from .groups import Group
 from .packing import pack_flags, pack_integers, pack_runs, pack_sparse
 from .plan import DecoderPlan
 from .tables import NodeTable, Slots, argsort, make_node_table, make_slots
-
-_ROOT = math.sqrt(0.5)
+from .weights import ROOT
 
 
 class Entries(NamedTuple):
@@ -92,7 +90,7 @@ def store_entries(g: Graph, plan: DecoderPlan, visible: Value | None) -> Storage
 
 
 def _list_gaussians(g: Graph, plan: DecoderPlan, slots: Slots, tile: Value, count: int) -> tuple[Value, Value]:
-    """Which Gaussian each of `count` entries is, (P,), and 1, or 0 where it only fills a list up, (P, 1)."""
+    """Return the Gaussian of each of `count` entries, (P,), and a mask, (P, 1): 0 for entries that fill a list up."""
     lengths = pack_integers(g, np.concatenate([group.lengths for group in plan.groups]))
     longest = pack_runs(g, np.concatenate([np.full(len(group.tiles), group.longest) for group in plan.groups]))
     firsts, begins = (g.CumSum(n, 0, exclusive=1) for n in (lengths, longest))
@@ -104,10 +102,9 @@ def _list_gaussians(g: Graph, plan: DecoderPlan, slots: Slots, tile: Value, coun
 
 
 def _sorted_pairs(g: Graph, plan: DecoderPlan, slots: Slots) -> Value:
-    """Which Gaussian each pair of Gaussian and tile is of, sorted by the tile's rank, then by Gaussian.
+    """Return the Gaussians of all pairs of Gaussian and tile, sorted by the tile's rank, then by Gaussian.
 
-    They are stored the other way, Gaussian by Gaussian: its first tile, and how many tiles lie between one and the
-    next, which is mostly none.
+    The file stores pairs sorted by Gaussian: the first tile of each, and the gaps between its tiles, mostly 0.
     """
     gaussian, tile = plan.pairs
     is_first = np.diff(gaussian, prepend=-1) > 0
@@ -133,11 +130,7 @@ def _whiten(
     centre = (place + 0.5) * TILE
     x, y = g.split(centre[tile] - g.constant(plan.gaussians.means)[ids], 2, axis=1)
     l11, l21, l22 = g.split(g.constant(plan.gaussians.cholesky)[ids], 3, axis=1)
-    slope = l21 / l11
-    e1, k1, k4 = x / l11, g.Reciprocal(l11), g.Reciprocal(l22)
-    e2 = (y - slope * x) / l22
-    k3 = -(slope / l22)
-    z = g.Concat(e1, k1, e2, k3, k4, axis=1) * _ROOT
+    z = g.Concat(*affine_coefficients(x, y, l11, l21, l22), axis=1) * ROOT
     z = g.Clip(z, float(-Z_LIMIT), float(Z_LIMIT))
     e1, k1, e2, k3, k4 = g.split(z, 5, axis=1)
     squares = g.Concat(e1, k1, k1 * 0, e2, k3, k4, axis=1)

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import onnx
 import torch
 
 from kcgs._check import check_cutoff
-from kcgs.kernels import support_radius
+from kcgs.kernels import least_whitened, support_radius, whiten
 
 from .graph import BOOL, FLOAT, INT64, Graph, Value
 from .metadata import decoder_metadata, image_doc
-from .weights import weigh
+from .weights import ROOT, weigh
 
 # side of a tile in pixels: smaller ones take more turns of the loop, larger ones more Gaussians that reach none of
 # their pixels
 _SIDE = 32
-# factor on the support, so that rounding drops no Gaussian that has a weight
-_SLACK = 1.001
 
 
 def generic_decoder(*, cutoff: float = 1e-4, clamp: bool = True) -> onnx.ModelProto:
@@ -65,30 +61,29 @@ def generic_decoder(*, cutoff: float = 1e-4, clamp: bool = True) -> onnx.ModelPr
     tiles = (size + (_SIDE - 1)) // _SIDE  # down, across
     memberships = g.Pad(memberships, g.Concat([0] * 4, tiles * _SIDE - size, axis=0))
     l11, l21, l22 = g.split(cholesky, 3, axis=1)
-    spread = g.Concat(l11, g.Sqrt(l21 * l21 + l22 * l22), axis=1)
-    reach = spread * (support_radius(cutoff, torch.float32) * _SLACK)
-    # log w is minus the sum of two squares, each of a difference times one of these
-    inverses = math.sqrt(0.5) / g.Concat(l11, l22, axis=1)
-    frame = g.Concat(means, inverses, l21 / l11, axis=1)  # [N, 5]
+    frame = g.Concat(means, ROOT / l11, l21 / l11, ROOT / l22, axis=1)  # [N, 5]
+    columns = g.split(g.Transpose(frame, perm=[1, 0]), 5)  # [1, N]
+    numbers, across = g.Range(0, g.Squeeze(g.Shape(ids)), 1), g.Gather(tiles, 1)
+    radius = support_radius(cutoff, torch.float32) * ROOT
 
     def render_tile() -> list[Value]:
         number, condition = g.input("tile", INT64, []), g.input("more", BOOL, [])
-        across = g.Gather(tiles, 1)
         corner = g.Concat(g.Reshape(number % across, [1]), g.Reshape(number // across, [1]), axis=0) * _SIDE  # x, y
         begin = corner[g.constant([1, 0])]
         window = g.Slice(memberships, begin, begin + _SIDE, [1, 2])
         window = g.Reshape(window, [0, -1])  # [R, pixels]
         middle = corner.astype(FLOAT) + _SIDE / 2
-        overlap = g.LessOrEqual(g.Abs(means - middle), reach + _SIDE / 2).astype(FLOAT)
-        overlap = g.ReduceMin(overlap, [1], keepdims=0)
+        left, top = g.split(middle, 2)
+        x, y, k1, slope, k2 = columns
+        z1, z2 = least_whitened(left - x, top - y, k1, slope, k2, _SIDE / 2)
         share = g.ReduceMax(window, [1], keepdims=0)[ids]
-        gaussian = g.Compress(g.Range(0, g.Squeeze(g.Shape(ids)), 1), g.Greater(overlap * share, 0.0), axis=0)  # [K]
-        x, y, k1, k2, slope = g.split(g.Unsqueeze(frame[gaussian], [2, 3]), 5, axis=1)  # [K, 1, 1, 1]
-        left, top = g.split(middle, [1, 1])
+        near = g.And(g.LessOrEqual(g.Max(z1, z2), radius), g.Greater(share, 0.0))
+        gaussian = g.Compress(numbers, g.Squeeze(near, [0]), axis=0)  # [K]
+        x, y, k1, slope, k2 = g.split(g.Unsqueeze(frame[gaussian], [2, 3]), 5, axis=1)  # [K, 1, 1, 1]
         offsets = np.arange(_SIDE, dtype=np.float32) - np.float32((_SIDE - 1) / 2)
         # pixel minus mean before anything is multiplied: nothing cancels where a Gaussian is far below a pixel wide
         dx, dy = (left - x) + offsets, (top - y) + offsets[:, None]
-        z1, z2 = dx * k1, (dy - slope * dx) * k2
+        z1, z2 = whiten(dx, dy, k1, slope, k2)
         weight = g.Flatten(weigh(g, -(z1 * z1 + z2 * z2), cutoff))
         weight = weight * window[ids[gaussian]]
         return [g.Identity(condition), g.Transpose(colors[gaussian], perm=[1, 0]) @ weight]

@@ -50,7 +50,8 @@ def _arithmetic(operator: str, reflected: bool = False) -> Callable[[Value, Oper
 class Value:
     """A tensor of a graph. Arithmetic adds operators to the graph; `x[i]` gathers along the first axis.
 
-    Numbers of Python take the type of the value. Division of integers rounds towards zero.
+    Numbers of Python take the type of the value. Division of integers rounds towards zero. Methods that are named as
+    torch's let formulas of `kcgs.maps` and `kcgs.kernels` take values.
     """
 
     __array_ufunc__ = None  # numpy leaves arithmetic of its arrays and values to this class
@@ -69,9 +70,22 @@ class Value:
     __floordiv__ = _arithmetic("Div")
     __mod__ = _arithmetic("Mod")
     __matmul__ = _arithmetic("MatMul")
+    clamp_min = _arithmetic("Max")
 
     def __neg__(self) -> Value:
         return self.graph.Neg(self)
+
+    def abs(self) -> Value:
+        """Apply Abs."""
+        return self.graph.Abs(self)
+
+    def reciprocal(self) -> Value:
+        """Apply Reciprocal."""
+        return self.graph.Reciprocal(self)
+
+    def sqrt(self) -> Value:
+        """Apply Sqrt."""
+        return self.graph.Sqrt(self)
 
     def __getitem__(self, indices: Value) -> Value:
         return self.graph.Gather(self, indices)

@@ -1,7 +1,7 @@
-"""What wide Gaussians render, carried from coarse grids to the pixels by cubic B-splines.
+"""Wide Gaussians: evaluated at the nodes of coarse grids, and interpolated at the pixels by cubic B-splines.
 
-Grids are of the scene, not of the output: blocks of nodes are evaluated and refined when the decoder is loaded, and the
-output reads the nodes two pixels apart. Blocks lie in memory column by column.
+The grids are those of the scene at any size of the output, so that their nodes are evaluated when the decoder is
+loaded. The output reads the finest grid, whose nodes are two pixels apart. Blocks lie in memory column by column.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class CoarseGrids:
         return g.Concat(*values, axis=0)[g.Min(rank - tiles, np.int32(last))]
 
     def _refine(self, values: Value) -> Value:
-        """Add to each grid what the next coarser one says there; return the quarters of the finest one's blocks."""
+        """Add to each grid the next coarser one, interpolated; return the quarters of the finest one's blocks."""
         g, channels, table = self.graph, self.storage.channels, self.table
         counts = np.bincount(table.nodes.place[:, 0]).tolist()
         ids = self._find_quarters(table.level + 1, table.region, table.row, table.col)
@@ -117,9 +117,9 @@ class CoarseGrids:
         return quarters
 
     def _find_quarters(self, level: Value | np.int32, region: Value, row: Value, col: Value) -> Value:
-        """Which quarters of blocks of a level blocks (n,) of the finer one lie in, down and across, (n, 2, 2).
+        """Find the quarters of blocks of a level under blocks (n,) of the next finer one, down and across, (n, 2, 2).
 
-        A block is as large as two by two quarters, from the one of its own row and column on.
+        A block covers two by two quarters; the first is that of its own row and column.
         """
         g, (_, regions, rows, cols) = self.graph, self.table.nodes.shape
         two = g.constant(np.arange(2, dtype=np.int32))

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from kcgs.maps import LEAST_BLUR, PIXEL
+from kcgs.maps import sharpness
 
 from .axis import Axis, Interpolator
 from .blur import BlurredWindows, cut_windows
@@ -36,13 +36,13 @@ def make_membership(storage: Storage, down: Axis, across: Axis) -> MembershipSam
         for m in (membership, smooth)
     )
     if width_index is None:
-        exponent = _sharpness(g, g.constant(np.array([widths[0] ** 2], np.float32)), ratio)
+        exponent = sharpness(g.constant(np.array([widths[0] ** 2], np.float32)), ratio)
         return MembershipSampler(g, places, windows, smooth_windows, lambda *_: exponent)
     width = pack_windows(g, cut_windows(tiles, tile_ids(tiles_of), width_index[0].cpu().numpy()))
     variances = split_tiles(g, tiles_of, g.constant(np.array(widths, np.float32) ** 2)[width])
 
     def sample(count: int, slots: Value, row: Value, col: Value) -> Value:
-        return _sharpness(g, places.blocks(variances[count][slots], row, col, (1, 1)), ratio)
+        return sharpness(places.blocks(variances[count][slots], row, col, (1, 1)), ratio)
 
     return MembershipSampler(g, places, windows, smooth_windows, sample)
 
@@ -88,12 +88,6 @@ class MembershipSampler:
             return g.Reshape(g.Slice(windows, [1, 1], [-1, -1], [2, 3]), [0, 1, count, 1, -1])
 
         return g.choose(places.is_native, cut, lambda: g.choose(places.is_aligned, pan, sample))
-
-
-def _sharpness(g: Graph, variance: Value, ratio: Value) -> Value:
-    """Evaluate `kcgs.maps.sharpness` by operators, since the ratio is known only when the graph runs."""
-    width = g.Max(variance - PIXEL, 0.0) * ratio + PIXEL
-    return g.Sqrt((g.Max(variance, LEAST_BLUR**2) + PIXEL) * ratio / width)
 
 
 def _sharpen(g: Graph, samples: Value, exponent: Value) -> Value:

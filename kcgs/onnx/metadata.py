@@ -1,4 +1,4 @@
-"""The metadata of a decoder, and the doc string of its image: written by both decoders, read by `describe_decoder`."""
+"""The metadata that both decoders write and `describe_decoder` reads, and the doc string of the image."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _CHANNELS = {1: "grey", 3: "red, green, blue"}
 
 
 def describe_decoder(model: onnx.ModelProto) -> dict[str, object]:
-    """Read what a decoder says of itself.
+    """Read the metadata of a decoder.
 
     Args:
         model: made by :func:`kcgs.onnx.scene_decoder` or :func:`kcgs.onnx.generic_decoder`.

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from .graph import Graph, Value
+
+# scales whitened coordinates z: log w is then minus the sum of their squares
+ROOT = math.sqrt(0.5)
 
 
 def monomials(g: Graph, x: Value, y: Value) -> Value:
