@@ -15,7 +15,8 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-SIDE = 16  # of a tile
+from kcgs.maps import TILE as SIDE
+
 HALF = SIDE // 2  # elements of a vector
 HALVES = 2
 FLOAT = ir.FloatType()
