@@ -25,8 +25,9 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
 from numba.extending import intrinsic
+
+from kcgs._numba_internals import cgutils
 
 from .program import inner
 from .threads import num_threads

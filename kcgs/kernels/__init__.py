@@ -13,7 +13,7 @@ All take the inputs of `interface`, and share `whitened` coordinates.
 
 from .coarse_grids import Blocks, Coarsened, choose_levels, coarsen, make_blocks, max_spacing
 from .cuda.capacity import settle, without_waiting
-from .interface import Kernel, SplatInputs, with_autograd
+from .interface import Kernel, SplatInputs
 from .registry import BACKENDS, check_backend, resolve, takes_triton, warm_up
 from .tiles import bounding_tiles, find_keys
 from .whitened import MEAN_LIMIT, SCALE_LIMITS, SCALE_TOLERANCE, Z_LIMIT, least_exponent, support_radius
@@ -21,6 +21,6 @@ from .whitened import MEAN_LIMIT, SCALE_LIMITS, SCALE_TOLERANCE, Z_LIMIT, least_
 __all__ = [
     "BACKENDS", "MEAN_LIMIT", "SCALE_LIMITS", "SCALE_TOLERANCE", "Z_LIMIT", "Blocks", "Coarsened", "Kernel",
     "SplatInputs", "bounding_tiles", "check_backend", "choose_levels", "coarsen", "find_keys", "least_exponent",
-    "make_blocks", "max_spacing", "resolve", "settle", "support_radius", "takes_triton", "warm_up", "with_autograd",
+    "make_blocks", "max_spacing", "resolve", "settle", "support_radius", "takes_triton", "warm_up",
     "without_waiting",
 ]  # fmt: skip
