@@ -17,11 +17,11 @@ from torch.nn.functional import avg_pool2d
 
 from kcgs import fit
 from kcgs.data import save_image
-from kcgs.functional import psnr
+from kcgs.functional import psnr, ssimulacra2
 from kcgs.rate import fit_bytes
 from kcgs.segment import segment
 
-from .core.codecs import best_file, ssimulacra2
+from .core.codecs import best_file
 from .core.compare import group_by, markdown
 from .core.figures import save_shares
 from .core.fits import QUICK_ITERATIONS
@@ -84,7 +84,7 @@ def measure(image: str, comparison: str, folder: str, data: str, quick: bool) ->
     Path(folder).mkdir(parents=True, exist_ok=True)
     save_image(_path(folder, rows[0]), cat([photo, *images], 2))
     return [
-        {**row, "psnr": float(psnr(render, photo)), "ssimulacra2": ssimulacra2(render, photo)}
+        {**row, "psnr": float(psnr(render, photo)), "ssimulacra2": float(ssimulacra2(render, photo))}
         for row, render in zip(rows, images, strict=True)
     ]
 

@@ -16,10 +16,10 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from kcgs.data import load_image, save_image
-from kcgs.functional import psnr
+from kcgs.functional import psnr, ssimulacra2
 from kcgs.rate import fit_bytes
 
-from .core.codecs import best_file, ssimulacra2
+from .core.codecs import best_file
 from .core.compare import Comparison, count_wins, differences, group_by, losses_table, mean_gain, means_table
 from .core.figures import save_rows
 from .core.fits import QUICK_ITERATIONS
@@ -72,7 +72,7 @@ def measure(image: str, method: str, target_bytes: int, folder: str, data: str, 
     row |= {"core_seconds": time.process_time() - start} if method == OURS else {}
     row["psnr"] = float(psnr(render, photo))
     colors = (rgb2lab(values.clamp(0, 1).permute(1, 2, 0).numpy()) for values in (photo, render))
-    row |= {"delta_e": float(deltaE_ciede2000(*colors).mean()), "ssimulacra2": ssimulacra2(render, photo)}
+    row |= {"delta_e": float(deltaE_ciede2000(*colors).mean()), "ssimulacra2": float(ssimulacra2(render, photo))}
     if image in FIGURE and target_bytes == FIGURE_BYTES:
         Path(folder).mkdir(parents=True, exist_ok=True)
         save_image(Path(folder, f"{image}-{method}.png"), torch.cat([photo, render.clamp(0, 1)], 2))

@@ -10,9 +10,10 @@ from statistics import fmean
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+from kcgs.functional import ssimulacra2
 from kcgs.rate import fit_bytes
 
-from .core.codecs import available_codecs, decode_file, largest_file, ssimulacra2
+from .core.codecs import available_codecs, decode_file, largest_file
 from .core.compare import (
     Comparison,
     at_equal_bits,
@@ -79,7 +80,7 @@ def measure(image: str, group: str, method: str, sizes: list[int], data: str, qu
             size, render = len(file), decode_file(file)
         row = {"group": group, "image": image, "method": method, "target_bytes": target_bytes, "bytes": size}
         row |= {"bpp": 8 * size / pixels[0].numel(), "core_seconds": time.process_time() - start}
-        rows.append(row | measure_render(render, pixels, labels) | {"ssimulacra2": ssimulacra2(render, pixels)})
+        rows.append(row | measure_render(render, pixels, labels) | {"ssimulacra2": float(ssimulacra2(render, pixels))})
     return rows
 
 

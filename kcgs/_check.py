@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kcgs._torch_internals import assert_async, unwrapped
 from kcgs.errors import InvalidArgument, InvalidArgumentType
 
 _FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
@@ -52,12 +53,11 @@ def check_floating(
 def verify(condition: Tensor, message: str) -> bool:
     """Return whether `condition` is true; in a graph and on CUDA, True, and an assertion without a host sync."""
     try:
-        torch._assert_async(condition, message)
+        assert_async(condition, message)
     except RuntimeError:
-        inner = condition
-        while torch._C._functorch.is_functorch_wrapped_tensor(inner):  # vmap has no rule for assertions,
-            inner = torch._C._functorch.get_unwrapped(inner)
-        if inner is not condition and not inner.all():  # nor for reading the values that a message shows
+        inner = unwrapped(condition)
+        # vmap has no rule for assertions, nor for reading the values that a message shows
+        if inner is not condition and not inner.all():
             raise ValueError(message) from None
         return inner is not condition
     return True

@@ -14,7 +14,7 @@ import torch
 from PIL import Image, features
 from torch import Tensor
 
-from kcgs.functional import psnr
+from kcgs.functional import psnr, ssimulacra2
 
 from .images import resize
 
@@ -90,19 +90,7 @@ def best_file(
         if len(data) <= max_bytes:
             name = codec if reduction == 1 else f"{codec} at 1/{reduction}"
             files.append(ReducedFile(name, data, resize(decode_file(data), size, "bicubic")))
-    return max(files, key=lambda file: ssimulacra2(file.render, image), default=None)
-
-
-def ssimulacra2(render: Tensor, image: Tensor) -> float:
-    """Compare images (3, H, W) in 8 bits, as people see them."""
-    from ssimulacra2 import compute_ssimulacra2
-
-    files = []
-    for values in (image, render):
-        file = BytesIO()
-        Image.fromarray(_pixels(values)).save(file, "PPM")
-        files.append(file)
-    return float(compute_ssimulacra2(*files))
+    return max(files, key=lambda file: float(ssimulacra2(file.render, image)), default=None)
 
 
 def _pixels(image: Tensor) -> np.ndarray:

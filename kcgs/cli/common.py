@@ -6,7 +6,6 @@ import json
 import logging
 import math
 import signal
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,14 +17,6 @@ from kcgs.errors import InvalidArgument
 
 # exit status of a program that Ctrl-C ended
 INTERRUPTED = 130
-# when a metric is not defined
-_UNDEFINED = {
-    "ms_ssim": ": a side is below 161 pixels",
-    "ssim": ": a side is below 11 pixels",
-    "ef_ssim": ": no contours, or a side is below 11 pixels",
-    "ef_psnr": ": no contours",
-    "ssimulacra2": ": a side is below 8 pixels",
-}
 
 
 def _scene_path(text: str, other_suffixes: tuple[str, ...] = ()) -> Path:
@@ -90,9 +81,9 @@ def replace_undefined(report: dict[str, Any]) -> dict[str, Any]:
 
 def _explain_undefined(name: str) -> str:
     """Say why a metric of `evaluate` is not defined."""
-    if name == "ssimulacra2" and find_spec("ssimulacra2") is None:
-        return "not defined: it needs pip install ssimulacra2"
-    return f"not defined{_UNDEFINED.get(name, '')}"
+    from kcgs.functional import METRICS
+
+    return f"not defined: {METRICS[name].undefined}" if name in METRICS else "not defined"
 
 
 def print_report(report: dict[str, Any], as_json: bool, title: str) -> None:

@@ -15,7 +15,6 @@ from __future__ import annotations
 import functools
 import hashlib
 import logging
-import pickle
 import re
 import sys
 import tempfile
@@ -26,12 +25,9 @@ from typing import Any, cast
 
 import llvmlite
 import numba
-from numba.core import caching, config
-from numba.core.compiler import CompileResult
-from numba.core.serialize import dumps
-from numba.misc.appdirs import AppDirs
 
 from kcgs._atomic import write_file
+from kcgs._numba_internals import AppDirs, NullCache, config, from_bytes, set_cache, to_bytes
 
 log = logging.getLogger("kcgs")
 _config: Any = config
@@ -63,7 +59,7 @@ class Program:
     def entry(self, function: Callable[..., Any]) -> Callable[..., Any]:
         """Decorate a function that Python calls."""
         dispatcher: Any = cast(Any, numba.njit)(nogil=True, no_cfunc_wrapper=True, error_model="numpy")(function)
-        dispatcher._cache = _Cache(function, self)
+        set_cache(dispatcher, _Cache(function, self))
         return cast(Callable[..., Any], dispatcher)
 
     @functools.cached_property
@@ -81,7 +77,7 @@ class Program:
                 log.info("kcgs: compiling the %s, once on this machine", self._name)
 
 
-class _Cache(caching.NullCache):
+class _Cache(NullCache):
     """What a function compiles to, on disk: for each signature a file of a pickle with its SHA-256 in front.
 
     numba's own cache sees a change of one source only, and hands damaged code to LLVM, which may abort the process.
@@ -102,14 +98,14 @@ class _Cache(caching.NullCache):
         if content is None:
             self._program.announce()
             return None
-        return CompileResult._rebuild(context, *pickle.loads(content))
+        return from_bytes(context, content)
 
     def save_overload(self, signature: Any, result: Any) -> None:
         path = self._path(signature, result.codegen)
         if path is None:
             return
         assert not result.library.has_dynamic_globals, "an address, of a large global array, is for one process"
-        content: bytes = dumps(result._reduce())
+        content = to_bytes(result)
         try:
             write_file(path, hashlib.sha256(content).digest() + content)
         except OSError as error:

@@ -25,8 +25,9 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
 from numba.extending import intrinsic
+
+from kcgs._numba_internals import cgutils
 
 from .program import inner
 from .threads import num_threads
@@ -50,7 +51,7 @@ _YIELDS = 400
 _MICROSECONDS = 20  # of a sleep
 
 
-def run_tasks(function: Callable[[Any, Any], None], tasks: Any, threads: int | None = None) -> None:
+def run_tasks(function: Callable[[Any, Any], None], tasks: Any, work: int | None = None, per_thread: int = 1) -> None:
     """Call function(tasks, counters) on this thread and on others; return when all is done.
 
     An exception in one thread ends the others after their present tasks, and reaches the caller.
@@ -58,7 +59,8 @@ def run_tasks(function: Callable[[Any, Any], None], tasks: Any, threads: int | N
     Args:
         function: a loop over tasks, as above.
         tasks: see above.
-        threads: the most that the work is enough for; None: as many as there are tasks.
+        work: number of rows, pairs or pixels; None: there are as many threads as tasks.
+        per_thread: of them, for which another thread is woken.
     """
     counters, errors, running = np.zeros(_FLAGS + len(tasks), np.int64), list[BaseException](), list[None]()
 
@@ -72,7 +74,7 @@ def run_tasks(function: Callable[[Any, Any], None], tasks: Any, threads: int | N
         finally:
             running.pop()
 
-    count = min(num_threads(), len(tasks) if threads is None else threads)
+    count = min(num_threads(), len(tasks) if work is None else 1 + work // per_thread)
     if count > 1:
         # one that starts too late finds nothing to do, so nobody waits for it
         _helpers(os.getpid()).call(run, count - 1)

@@ -1,7 +1,7 @@
 """Edit scenes by region: new scenes, and images of regions alone or over another image."""
 
 from .inpainting import inpaint
-from .masks import check_offset, dilate, nearest_labels, shift_labels
+from .masks import check_offset, dilate, shift_labels
 from .recoloring import recolor_region
 from .render import render_over, render_region
 from .scenes import delete_region, extract_region, move_region, replace_background

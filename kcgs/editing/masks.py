@@ -24,14 +24,6 @@ def dilate(mask: Tensor, reach: int) -> Tensor:
     return max_pool2d(rows, (1, 2 * reach + 1), 1, (0, reach))[0] > 0
 
 
-def nearest_labels(labels: Tensor, hole: Tensor) -> Tensor:
-    """Give pixels of the hole, (H, W) bool, the label of the nearest other pixel."""
-    from scipy.ndimage import distance_transform_edt
-
-    rows, cols = distance_transform_edt(hole.cpu().numpy(), return_distances=False, return_indices=True)
-    return labels[torch.from_numpy(rows).long(), torch.from_numpy(cols).long()]
-
-
 def shift_labels(labels: Tensor, mask: Tensor, offset: tuple[int, int], background: Tensor) -> tuple[Tensor, Tensor]:
     """Move the labels of a mask over those of a background, (..., H, W); return the mask, moved, and all labels."""
     dx, dy = (max(-length, min(step, length)) for length, step in zip(labels.shape[:-3:-1], offset, strict=True))

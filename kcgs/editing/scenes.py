@@ -9,12 +9,12 @@ import torch
 
 from kcgs._check import check_count
 from kcgs.functional import RegionMap
-from kcgs.maps import PairSoftness, touching_pairs
+from kcgs.maps import PairSoftness, nearest_labels, touching_pairs
 from kcgs.nn import GaussianField, join, scaled_gaussians
 from kcgs.scene import Scene, check_scene
 
 from .fill import MARGIN, fill_hole
-from .masks import check_offset, dilate, nearest_labels, shift_labels
+from .masks import check_offset, dilate, shift_labels
 from .selection import members_of, select_regions, select_removable_regions, warn_of_lost_regions
 
 # standard deviations of a soft contour beyond which it is taken as 0 or 1

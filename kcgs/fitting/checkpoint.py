@@ -117,12 +117,13 @@ def _from_plain(plain: dict[str, Any], problem: Problem) -> FitState:
 def _scene_to_plain(scene: Scene) -> dict[str, Any]:
     field = scene.field
     tensors = [field.means.detach(), field.cholesky.detach(), field.colors.detach(), field.region_ids]
-    return {"tensors": tensors, "regions": None if scene.regions is None else scene.regions.state()}
+    return {"tensors": tensors, "regions": scene.get_extra_state()["regions"]}
 
 
 def _scene_from_plain(plain: dict[str, Any], size: tuple[int, int]) -> Scene:
-    regions = None if plain["regions"] is None else RegionMap.from_state(plain["regions"])
-    return Scene(GaussianField(*plain["tensors"], size=size), regions)
+    scene = Scene(GaussianField(*plain["tensors"], size=size))
+    scene.set_extra_state({"regions": plain["regions"], "metadata": None})
+    return scene
 
 
 def _best_to_plain(best: Best) -> dict[str, Any]:

@@ -26,7 +26,7 @@ def mean_errors(rendered: Any, image: Any, band: Any, *, is_squared: bool) -> An
     batch, _, height, width = rendered.shape
     loss, squares = np.zeros((batch, width)), np.zeros((batch, width))
     loop = partial(_sum_columns, rendered, image, is_squared, loss, squares)
-    run_tasks(loop, ranges(batch * width, _COLUMNS), 1 + batch * height * width // _THREAD_PIXELS)
+    run_tasks(loop, ranges(batch * width, _COLUMNS), batch * height * width, _THREAD_PIXELS)
     return _mean(rendered, image, band, loss, squares)
 
 

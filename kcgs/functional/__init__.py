@@ -14,26 +14,15 @@ from .covariance import (
 )
 from .evaluation import squared_error_gradients
 from .merging import merge_regions
-from .metrics import (
-    K1,
-    K2,
-    SCALE_WEIGHTS,
-    SSIM_SIGMA,
-    SSIM_WINDOW,
-    ef_psnr,
-    ef_ssim,
-    ms_ssim,
-    psnr,
-    ssim,
-    window_mean,
-    window_taps,
-)
+from .metrics import METRICS, ef_psnr, ef_ssim, ms_ssim, psnr, ssim, ssimulacra2
+from .similarity import K1, K2, SCALE_WEIGHTS, SSIM_SIGMA, SSIM_WINDOW, window_mean, window_taps
 from .splat import region_splat, splat_at
 from .tokens import NUM_GEOMETRY, from_tokens, to_tokens
 
 # public; what else is imported here is for the other rooms of kcgs
 __all__ = [
     "PairSoftness", "RegionMap", "activate_gaussians", "cholesky_to_covariance", "cholesky_to_scale_rotation",
-    "choose_softness", "covariance_to_cholesky", "edge_band", "ef_psnr", "ef_ssim", "from_tokens", "lookup_regions",
-    "merge_regions", "ms_ssim", "psnr", "region_splat", "scale_rotation_to_cholesky", "ssim", "to_tokens",
+    "choose_softness", "covariance_to_cholesky", "edge_band", "ef_psnr", "ef_ssim",
+    "from_tokens", "lookup_regions", "merge_regions", "ms_ssim", "psnr", "region_splat", "scale_rotation_to_cholesky",
+    "ssim", "ssimulacra2", "to_tokens",
 ]  # fmt: skip

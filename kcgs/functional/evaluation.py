@@ -11,7 +11,8 @@ from typing import Any, NamedTuple, NoReturn
 import torch
 from torch import Tensor
 
-from kcgs.kernels import Kernel, SplatInputs, resolve, with_autograd
+from kcgs._torch_internals import with_autograd
+from kcgs.kernels import Kernel, SplatInputs, resolve
 from kcgs.maps import RegionMap, positions_of, table_and_size, with_positions
 
 from .arguments import SplatArguments

@@ -1,8 +1,11 @@
-"""How far an image is from another: PSNR, SSIM and MS-SSIM over the image, PSNR and SSIM along the contours."""
+"""How far an image is from another: the metrics, and the list of them that `evaluate` and the reports follow."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from io import BytesIO
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,17 +16,10 @@ from kcgs._labels import check_labels
 from kcgs._warn import warn_user
 from kcgs.maps import edge_band
 
-from .blur import blur, gaussian_taps
+from .similarity import SCALE_WEIGHTS, SSIM_WINDOW, mean_ssim
 
-# Wang et al. 2004
-SSIM_WINDOW = 11  # pixels
-SSIM_SIGMA = 1.5  # pixels
-K1 = 0.01  # of the luminance, as a share of the data range
-K2 = 0.03  # of contrast and structure
-SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)  # Wang et al. 2003, finest scale first
-_MARGIN = SSIM_WINDOW // 2  # pixels
-_MS_SSIM_SIDE = (SSIM_WINDOW - 1) * 2 ** (len(SCALE_WEIGHTS) - 1) + 1  # pixels: the coarsest scale holds one window
-_BLOCK = 1 << 18  # pixels that are compared at a time: they stay in a processor's cache
+# of MS-SSIM; the coarsest of its scales holds one window
+_MS_SSIM_SIDE = (SSIM_WINDOW - 1) * 2 ** (len(SCALE_WEIGHTS) - 1) + 1  # pixels
 
 
 def psnr(image: Tensor, target: Tensor) -> Tensor:
@@ -73,7 +69,7 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     image, target, batch_shape = _check_pair(image, target)
     if min(image.shape[-2:]) < SSIM_WINDOW:
         return _nan("ssim", image, batch_shape, SSIM_WINDOW)
-    return _mean_ssim(image, target).mean(1).to(image.dtype).reshape(batch_shape)
+    return mean_ssim(image, target).mean(1).to(image.dtype).reshape(batch_shape)
 
 
 def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
@@ -100,9 +96,9 @@ def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
         return _nan("ms_ssim", image, batch_shape, _MS_SSIM_SIDE)
     product = torch.ones((), dtype=torch.float64, device=image.device)
     for weight in SCALE_WEIGHTS[:-1]:
-        product = product * _mean_ssim(image, target, contrast=True).relu() ** weight
+        product = product * mean_ssim(image, target, contrast=True).relu() ** weight
         image, target = _halve(image), _halve(target)
-    product = product * _mean_ssim(image, target).relu() ** SCALE_WEIGHTS[-1]
+    product = product * mean_ssim(image, target).relu() ** SCALE_WEIGHTS[-1]
     return product.mean(1).to(image.dtype).reshape(batch_shape)
 
 
@@ -163,7 +159,58 @@ def ef_ssim(image: Tensor, target: Tensor, labels: Tensor, width: float = 5) -> 
     band = _check_band("ef_ssim", image, labels, width)
     if min(image.shape[-2:]) < SSIM_WINDOW:
         return _nan("ef_ssim", image, batch_shape, SSIM_WINDOW)
-    return _mean_ssim(image, target, band=band).mean(1).to(image.dtype).reshape(batch_shape)
+    return mean_ssim(image, target, band=band).mean(1).to(image.dtype).reshape(batch_shape)
+
+
+def ssimulacra2(image: Tensor, target: Tensor) -> Tensor:
+    r"""SSIMULACRA2 of the 8-bit values: how people judge an image that was compressed.
+
+    Convention: arguments, range and errors are those of :func:`psnr`, and `target` is the original. Equal images have
+    100, images that look equal 90, high, medium and low quality 70, 50 and 30; it may be negative. Below 225 pixels
+    per side it has fewer scales: compare only with images of that size. Not differentiable; about 0.3 s for 480 x 854.
+
+    Returns:
+        float64, on the CPU, 0-dim or :math:`(B)`. NaN, without a warning, where the package is missing, which `pip
+        install ssimulacra2` brings, a side is below 8 pixels, or the channels are neither grey nor RGB.
+
+    Example:
+        >>> ssimulacra2(torch.zeros(3, 7, 9), torch.zeros(3, 7, 9))
+        tensor(nan, dtype=torch.float64)
+
+    Source: Sneyers, "SSIMULACRA2", 2023.
+    """
+    image, target, batch_shape = _check_pair(image, target)
+    try:
+        from ssimulacra2 import compute_ssimulacra2
+    except ImportError:
+        compute_ssimulacra2 = None
+    if compute_ssimulacra2 is None or image.shape[1] not in (1, 3) or min(image.shape[2:]) < 8:
+        values = [math.nan] * len(image)
+    else:
+        values = [compute_ssimulacra2(_ppm(t), _ppm(i)) for i, t in zip(image, target, strict=True)]
+    return torch.tensor(values, dtype=torch.float64).reshape(batch_shape)
+
+
+class Metric(NamedTuple):
+    """A row of `METRICS`."""
+
+    function: Callable[..., Tensor]
+    """Of an image and a target, and of labels where `takes_labels`; as `psnr` and `ef_psnr` are."""
+    undefined: str = ""
+    """When it is NaN."""
+    takes_labels: bool = False
+    """Whether it is taken along contours."""
+
+
+# what `evaluate` and the command line report, in this order
+METRICS = {
+    "psnr": Metric(psnr),
+    "ssim": Metric(ssim, f"a side is below {SSIM_WINDOW} pixels"),
+    "ms_ssim": Metric(ms_ssim, f"a side is below {_MS_SSIM_SIDE} pixels"),
+    "ef_psnr": Metric(ef_psnr, "no contours", takes_labels=True),
+    "ef_ssim": Metric(ef_ssim, f"no contours, or a side is below {SSIM_WINDOW} pixels", takes_labels=True),
+    "ssimulacra2": Metric(ssimulacra2, "it needs pip install ssimulacra2, and 8 pixels per side"),
+}
 
 
 def _check_pair(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, torch.Size]:
@@ -215,59 +262,7 @@ def _halve(image: Tensor) -> Tensor:
     return avg_pool2d(pad(image, (0, width % 2, 0, height % 2), mode="replicate"), 2)
 
 
-def _mean_ssim(image: Tensor, target: Tensor, *, contrast: bool = False, band: Tensor | None = None) -> Tensor:
-    """Mean SSIM of each channel, or contrast and structure alone, where the window lies inside, or over a band.
-
-    Returns:
-        (B, C) float64.
-    """
-    batch, channels, height, width = image.shape
-    pixels: int | Tensor = (height - 2 * _MARGIN) * (width - 2 * _MARGIN)
-    if band is not None:
-        pixels = band.sum((1, 2, 3))[:, None]
-        image, target = (pad(t, [_MARGIN] * 4, mode="reflect") for t in (image, target))
-        band = band.expand(batch, channels, -1, -1).flatten(0, 1)
-    # compiled, a loop over blocks would be a graph of thousands of nodes
-    whole = torch.compiler.is_compiling()
-    planes = batch * channels if whole else max(1, _BLOCK // (height * width))
-    rows = image.shape[-2] if whole else max(8 * _MARGIN, _BLOCK // width)
-    images, targets = (t.flatten(0, 1).split(planes) for t in (image, target))
-    bands = [None] * len(images) if band is None else band.split(planes)
-    sums = [_sum_ssim(*group, contrast, rows) for group in zip(images, targets, bands, strict=True)]
-    return torch.cat(sums).reshape(batch, channels) / pixels
-
-
-def _sum_ssim(image: Tensor, target: Tensor, band: Tensor | None, contrast: bool, rows: int) -> Tensor:
-    """Add up the values of each plane (P, H, W), so many rows at a time; (P,) float64."""
-    total = image.new_zeros(len(image), dtype=torch.float64)
-    top, overhang = 0, image.new_empty((2, len(image), 0, image.shape[-1]))
-    for block in zip(image.split(rows, -2), target.split(rows, -2), strict=True):
-        # `split` and `cat`, since the gradient of overlapping slices would be as large as the image for each
-        window = torch.cat([overhang, torch.stack(block)], -2)
-        values = _similarity(window[0], window[1], contrast)
-        overhang, bottom = window[..., -2 * _MARGIN :, :], top + values.shape[-2]
-        values = values if band is None else values * band[:, top:bottom]
-        total, top = total + values.sum((1, 2), dtype=torch.float64), bottom
-    return total
-
-
-def _similarity(image: Tensor, target: Tensor, contrast: bool) -> Tensor:
-    """SSIM, or its contrast and structure alone, where the window lies inside."""
-    moments = window_mean(torch.stack([image, target, image * image, target * target, image * target]))
-    squares, product = (moments[:2] * moments[:2]), moments[0] * moments[1]
-    variances = (moments[2:4] - squares).clamp_min(0.0).sum(0)
-    c1, c2 = K1**2, K2**2
-    structure = (2 * (moments[4] - product) + c2) / (variances + c2)
-    return structure if contrast else structure * (2 * product + c1) / (squares.sum(0) + c1)
-
-
-def window_mean(maps: Tensor) -> Tensor:
-    """Filter by the Gaussian window along both sides, without padding."""
-    return blur(maps, window_taps())
-
-
-def window_taps() -> list[float]:
-    """Return half of the Gaussian window along one side, its centre first."""
-    taps = gaussian_taps(SSIM_SIGMA, _MARGIN)
-    total = sum([*taps[:0:-1], *taps])
-    return [tap / total for tap in taps]
+def _ppm(image: Tensor) -> BytesIO:
+    """Return an image (C, H, W) as a PPM file in memory, the format that is fastest to write."""
+    levels = (image.detach().float() * 255).round().byte().expand(3, -1, -1).permute(1, 2, 0)
+    return BytesIO(b"P6 %d %d 255\n" % (image.shape[2], image.shape[1]) + levels.cpu().contiguous().numpy().tobytes())

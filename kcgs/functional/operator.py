@@ -12,11 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcgs.maps import PER_MAP, SHARED, MapTable
-
-from .arguments import NUM_ARGUMENTS, SCHEMA, SplatArguments, place_of
-from .evaluation import Evaluation, differentiate, differentiate_forward, differentiate_twice, prepare, render
-from .torch_internals import (
+from kcgs._torch_internals import (
     apply,
     below_autograd,
     forward_derivatives,
@@ -27,6 +23,10 @@ from .torch_internals import (
     is_transforming,
     register_decomposition,
 )
+from kcgs.maps import PER_MAP, SHARED, MapTable
+
+from .arguments import NUM_ARGUMENTS, SCHEMA, SplatArguments, place_of
+from .evaluation import Evaluation, differentiate, differentiate_forward, differentiate_twice, prepare, render
 
 # arguments that are not differentiated by
 _NUM_CONSTANTS = NUM_ARGUMENTS - 3

@@ -6,13 +6,13 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_cutoff, check_floating, check_ids, check_rows, check_size
+from kcgs._torch_internals import register_decomposition
 from kcgs.kernels import check_backend
 from kcgs.maps import MapTable, RegionMap, table_and_size
 
 from .arguments import SplatArguments
 from .decomposition import decompose
 from .operator import splat_operator
-from .torch_internals import register_decomposition
 
 # for torch.onnx.export alone: compilers and torch.export keep the operator
 register_decomposition(splat_operator, decompose)

@@ -13,7 +13,7 @@ All take the inputs of `interface`, and share `whitened` coordinates.
 
 from .coarse_grids import Blocks, Coarsened, choose_levels, coarsen, make_blocks, max_spacing
 from .cuda.capacity import settle, without_waiting
-from .interface import Kernel, SplatInputs, with_autograd
+from .interface import Kernel, SplatInputs
 from .registry import BACKENDS, check_backend, resolve, takes_triton, warm_up
 from .tiles import bounding_tiles, find_keys
 from .whitened import (
@@ -32,5 +32,5 @@ __all__ = [
     "BACKENDS", "MEAN_LIMIT", "SCALE_LIMITS", "SCALE_TOLERANCE", "Z_LIMIT", "Blocks", "Coarsened", "Kernel",
     "SplatInputs", "affine_coefficients", "bounding_tiles", "check_backend", "choose_levels", "coarsen", "find_keys",
     "least_exponent", "least_whitened", "make_blocks", "max_spacing", "resolve", "settle", "support_radius",
-    "takes_triton", "warm_up", "whiten", "with_autograd", "without_waiting",
+    "takes_triton", "warm_up", "whiten", "without_waiting",
 ]  # fmt: skip

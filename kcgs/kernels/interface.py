@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import torch
 from torch import Tensor
 
 from kcgs.maps import MapTable
@@ -71,14 +69,3 @@ class Kernel(NamedTuple):
     checks_values: bool = False
     takes_one_image: bool = False
     looks_up_regions: bool = False
-
-
-@contextmanager
-def with_autograd() -> Iterator[None]:
-    """Record a graph inside of an operator; else nothing would be, since operators are evaluated below autograd."""
-    keys = torch._C.DispatchKey.AutogradFunctionality, torch._C.DispatchKey.ADInplaceOrView
-    with ExitStack() as stack:
-        for key in keys:
-            stack.enter_context(torch._C._SetExcludeDispatchKeyGuard(key, False))
-        stack.enter_context(torch.enable_grad())
-        yield

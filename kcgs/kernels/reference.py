@@ -11,9 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kcgs._torch_internals import with_autograd
 from kcgs.maps import membership_at
 
-from .interface import Gradients, Kernel, SplatInputs, with_autograd
+from .interface import Gradients, Kernel, SplatInputs
 from .whitened import Z_LIMIT
 
 # weights (pixels times Gaussians) that are evaluated at once: 32 MiB in float64

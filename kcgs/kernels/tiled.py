@@ -14,9 +14,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad, threshold
 
+from kcgs._torch_internals import with_autograd
 from kcgs.maps import TILE, table_at
 
-from .interface import Gradients, Kernel, SplatInputs, with_autograd
+from .interface import Gradients, Kernel, SplatInputs
 from .tiles import (
     TileGrid,
     bounding_tiles,

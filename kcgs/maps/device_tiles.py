@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .table import TILE
+from .tile import TILE
 from .widths import reach_of, truncated_gaussian
 
 # bytes of windows and what is made of them at once

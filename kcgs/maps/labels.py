@@ -192,6 +192,21 @@ def positions_of(region_ids: Tensor, ids: Tensor) -> Tensor:
     return torch.where(ids[places] == region_ids, places, -1)
 
 
+def nearest_labels(labels: Tensor, hole: Tensor) -> Tensor:
+    r"""Give pixels of the hole, :math:`(H, W)` bool, the label of the nearest other pixel.
+
+    Example:
+        >>> nearest_labels(torch.tensor([[7, 0, 0, 3]]), torch.tensor([[False, True, True, False]]))
+        tensor([[7, 7, 3, 3]])
+    """
+    from .nearest import spread  # loads numba
+
+    ids, index = compact(labels.cpu())
+    values = index.masked_fill(hole.cpu(), -1)[None]
+    spread(values.numpy(), index[None].numpy())
+    return ids[index.long()].to(labels.device)
+
+
 def sample_labels(labels: Tensor, height: int, width: int) -> Tensor:
     """Sample a label map at another size: each new pixel has the label of the one that its centre lies in."""
     for dim, new in ((-2, height), (-1, width)):

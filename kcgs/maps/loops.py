@@ -10,9 +10,9 @@ import numpy as np
 from kcgs.compiled.program import Program, inner
 from kcgs.compiled.tasks import first_task, next_task
 
-program = Program("tables of label maps")
+from .tile import TILE as SIDE
 
-SIDE = 16  # of a tile of `MapTable`: a number, so that the compiler makes vectors of rows
+program = Program("tables of label maps")
 
 
 @program.entry

@@ -17,7 +17,8 @@ from kcgs._arithmetic import Numbers
 from .antialiasing import SmoothLabels, antialias
 from .labels import sample_labels
 from .membership import Membership
-from .table import TILE, MapTable
+from .table import MapTable
+from .tile import TILE
 from .tiles import to_array, with_smooth_tiles
 from .widths import blurs_of
 

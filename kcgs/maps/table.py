@@ -11,8 +11,7 @@ from torch import Tensor
 from kcgs._labels import check_labels
 
 from .labels import compact
-
-TILE = 16  # pixels along a side
+from .tile import TILE
 
 
 class MapTable(NamedTuple):

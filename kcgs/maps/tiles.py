@@ -11,7 +11,8 @@ from torch import Tensor
 
 from .antialiasing import SmoothLabels
 from .device_tiles import tiles_on_device
-from .table import TILE, MapTable, with_positions
+from .table import MapTable, with_positions
+from .tile import TILE
 from .widths import blurs_of, reach_of
 
 # tiles of a task

@@ -80,7 +80,7 @@ def _step_geometry(state: dict[str, Tensor], group: dict[str, Any], finite: Tens
         adam = Adam(*_settings(group), *_averages(state))
         arrays = _rows(means, cholesky, *gradients)
         loop = partial(loops.step_geometry, *arrays, moves, adam, bounds_of(group))
-        run_tasks(loop, ranges(len(arrays[0]), _TASK_ROWS), 1 + len(arrays[0]) // _THREAD_ROWS)
+        run_tasks(loop, ranges(len(arrays[0]), _TASK_ROWS), len(arrays[0]), _THREAD_ROWS)
         increment_version([parameter for parameter in group["params"] if parameter.requires_grad])
         return
     moving = _moving_rows(state["age"], finite)

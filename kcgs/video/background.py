@@ -7,7 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcgs.editing import dilate, inpaint, nearest_labels
+from kcgs.editing import dilate, inpaint
+from kcgs.maps import nearest_labels
 
 from .flow import sample
 

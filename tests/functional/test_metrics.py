@@ -2,24 +2,29 @@
 
 import itertools
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 import pytorch_msssim
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 from scipy.ndimage import correlate1d, distance_transform_edt
 from skimage import data
 from torch import Tensor
 
-from kcgs.functional import edge_band, ef_psnr, ef_ssim, ms_ssim, psnr, ssim
+from kcgs.data import load_image, save_image
+from kcgs.functional import METRICS, edge_band, ef_psnr, ef_ssim, ms_ssim, psnr, ssim, ssimulacra2
+from kcgs.functional.similarity import mean_ssim
 from tests.tester import BaseTester
 
 Array = NDArray[np.float64]
 Metric = Callable[..., Tensor]
 PHOTOS = ("astronaut", "coffee")
-METRICS = (psnr, ssim, ms_ssim)
-SMALLEST = {psnr: (16, 16), ssim: (16, 16), ms_ssim: (161, 161)}
+# metrics in torch, of the whole image and along contours
+PLAIN = [metric.function for name, metric in METRICS.items() if not metric.takes_labels and name != "ssimulacra2"]
+EDGE_FOCUSED = [metric.function for metric in METRICS.values() if metric.takes_labels]
 
 
 def photo_pair(name: str, rows: int = 176, columns: int = 192) -> tuple[Tensor, Tensor]:
@@ -199,14 +204,14 @@ class TestAgainstPytorchMsssim:
 
 
 class TestEdgeFocused(BaseTester, without={"test_module": "metrics are functions"}):
-    @pytest.mark.parametrize("metric", [ef_psnr, ef_ssim])
+    @pytest.mark.parametrize("metric", EDGE_FOCUSED)
     def test_smoke(self, metric: Metric, device: torch.device, dtype: torch.dtype) -> None:
         image, target = (t.to(device, dtype) for t in photo_pair("coffee", 20, 24))
         value = metric(image, target, disc_labels(20, 24).to(device))
         assert value.isfinite() and value.device.type == device.type
         assert value.dtype == torch.promote_types(dtype, torch.float32)
 
-    @pytest.mark.parametrize("metric", [ef_psnr, ef_ssim])
+    @pytest.mark.parametrize("metric", EDGE_FOCUSED)
     @pytest.mark.parametrize(("lead", "channels"), [((), 1), ((1,), 3), ((2,), 4)])
     def test_cardinality(
         self, metric: Metric, device: torch.device, dtype: torch.dtype, lead: tuple[int, ...], channels: int
@@ -233,16 +238,16 @@ class TestEdgeFocused(BaseTester, without={"test_module": "metrics are functions
     )
     def test_exception(self, labels: Tensor, width: float, error: type[Exception], words: str) -> None:
         image = torch.rand(2, 3, 16, 20)
-        for metric in (ef_psnr, ef_ssim):
+        for metric in EDGE_FOCUSED:
             with pytest.raises(error, match=words):
                 metric(image, image, labels, width)
 
-    @pytest.mark.parametrize("metric", [ef_psnr, ef_ssim])
+    @pytest.mark.parametrize("metric", EDGE_FOCUSED)
     def test_gradcheck(self, metric: Metric) -> None:
         image, target = small_pair()
         self.gradcheck(metric, (image, target, disc_labels(11, 12), 2))
 
-    @pytest.mark.parametrize("metric", [ef_psnr, ef_ssim])
+    @pytest.mark.parametrize("metric", EDGE_FOCUSED)
     def test_dynamo(self, metric: Metric, device: torch.device, dtype: torch.dtype) -> None:
         image, target = (t.to(device, dtype) for t in small_pair())
         image.requires_grad_()
@@ -260,7 +265,7 @@ class TestEdgeFocused(BaseTester, without={"test_module": "metrics are functions
             assert abs(float(ef_psnr(image, target, labels, width)) - expected) < 1e-12
             expected = reference_ssim_map(image, target)[:, band].mean()
             assert abs(float(ef_ssim(image, target, labels, width)) - expected) < 1e-12
-        for metric in (ef_psnr, ef_ssim):
+        for metric in EDGE_FOCUSED:
             assert metric(image, target, labels) == metric(image, target, labels, 5)
 
     def test_errors_outside_the_band_do_not_count(self) -> None:
@@ -272,7 +277,7 @@ class TestEdgeFocused(BaseTester, without={"test_module": "metrics are functions
         assert ef_ssim(image, target, labels) > 0.999999
         assert psnr(image, target) < 20 and ssim(image, target) < 0.9
 
-    @pytest.mark.parametrize("metric", [ef_psnr, ef_ssim])
+    @pytest.mark.parametrize("metric", EDGE_FOCUSED)
     def test_one_map_for_all_or_one_each(self, metric: Metric) -> None:
         pairs = [photo_pair(name, 64, 80) for name in PHOTOS]
         images, targets = (torch.stack(part) for part in zip(*pairs, strict=True))
@@ -284,7 +289,7 @@ class TestEdgeFocused(BaseTester, without={"test_module": "metrics are functions
         torch.testing.assert_close(metric(images, targets, maps[:1]), shared, atol=1e-12, rtol=0)
         assert (each - shared).abs().tolist()[1] > 1e-3
 
-    @pytest.mark.parametrize("metric", [ef_psnr, ef_ssim])
+    @pytest.mark.parametrize("metric", EDGE_FOCUSED)
     def test_one_region_is_nan_and_says_so(self, metric: Metric) -> None:
         image, target = photo_pair("coffee", 20, 20)
         flat, split = torch.full((20, 20), 4), disc_labels(20, 20)
@@ -297,10 +302,10 @@ class TestEdgeFocused(BaseTester, without={"test_module": "metrics are functions
 
 
 class TestCardinality:
-    @pytest.mark.parametrize("metric", METRICS)
+    @pytest.mark.parametrize("metric", PLAIN)
     @pytest.mark.parametrize("channels", [1, 4])
     def test_any_channels_batched_or_not(self, metric: Metric, channels: int) -> None:
-        image, target = (t[torch.arange(channels) % 3].float() for t in photo_pair("coffee", *SMALLEST[metric]))
+        image, target = (t[torch.arange(channels) % 3].float() for t in photo_pair("coffee", 161, 161))
         single, other = metric(image, target), metric(target.flip(-1), target)
         assert single.shape == ()
         batch = metric(torch.stack([image, target.flip(-1)]), torch.stack([target, target]))
@@ -308,11 +313,11 @@ class TestCardinality:
         torch.testing.assert_close(batch, torch.stack([single, other]), atol=1e-5, rtol=0)
         assert abs(single - other) > 1e-2
 
-    @pytest.mark.parametrize("metric", METRICS)
+    @pytest.mark.parametrize("metric", PLAIN)
     @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
     def test_dtypes(self, metric: Metric, dtype: torch.dtype) -> None:
         """Half precision is computed in float32; two dtypes meet in the wider one."""
-        image, target = (t.to(dtype) for t in photo_pair("coffee", *SMALLEST[metric]))
+        image, target = (t.to(dtype) for t in photo_pair("coffee", 161, 161))
         wide = torch.promote_types(dtype, torch.float32)
         value = metric(image, target)
         assert value.dtype == wide and value == metric(image.to(wide), target.to(wide))
@@ -334,6 +339,28 @@ class TestTooSmall:
         with pytest.warns(RuntimeWarning, match=words) as warnings:
             values = metric(image, image)
         assert values.shape == (2,) and values.isnan().all() and warnings[0].filename == __file__
+
+
+class TestSsimulacra2:
+    def test_values(self, tmp_path: Path) -> None:
+        package = pytest.importorskip("ssimulacra2", reason="SSIMULACRA2 needs the package ssimulacra2")
+        photo = torch.from_numpy(data.astronaut()[:256, :240].copy()).permute(2, 0, 1).float() / 255
+        assert ssimulacra2(photo, photo) == 100
+        save_image(tmp_path / "photo.png", photo)
+        scores = []
+        for quality in (90, 50, 10):
+            Image.open(tmp_path / "photo.png").save(tmp_path / f"{quality}.jpg", quality=quality)
+            scores.append(float(ssimulacra2(load_image(tmp_path / f"{quality}.jpg"), photo)))
+            expected = package.compute_ssimulacra2(tmp_path / "photo.png", tmp_path / f"{quality}.jpg")
+            assert scores[-1] == pytest.approx(expected, abs=1e-9)
+        assert 100 > scores[0] > 70 > scores[1] > 40 > scores[2]
+        batch = ssimulacra2(torch.stack([photo, 0.9 * photo]), torch.stack([photo, photo]))
+        assert batch.tolist() == [100, float(ssimulacra2(0.9 * photo, photo))]
+        grey, dark = photo[:1], photo[:1] * 0.9
+        assert ssimulacra2(dark, grey) == ssimulacra2(dark.expand(3, -1, -1), grey.expand(3, -1, -1)) < 100
+
+    def test_not_defined(self) -> None:
+        assert all(ssimulacra2(t, t).isnan() for t in (torch.ones(3, 7, 60), torch.ones(4, 40, 60)))
 
 
 class TestGradient:
@@ -387,7 +414,7 @@ class _MetaDevice(Tensor):
 IMAGE = torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(0))
 
 
-@pytest.mark.parametrize("metric", METRICS)
+@pytest.mark.parametrize("metric", PLAIN)
 @pytest.mark.parametrize(
     ("image", "target", "error", "words"),
     [
@@ -416,10 +443,10 @@ class TestLargeImages:
     def test_blocks_agree_with_the_whole(self, metrics: list[Metric], monkeypatch: pytest.MonkeyPatch) -> None:
         image, target = photo_pair("coffee")
         images, targets = torch.stack([image, target.flip(-1)]).requires_grad_(), torch.stack([target, target])
-        monkeypatch.setattr(f"{psnr.__module__}._BLOCK", 1 << 30)
+        monkeypatch.setattr(f"{mean_ssim.__module__}._BLOCK", 1 << 30)
         whole = [metric(images, targets) for metric in metrics]
         slopes = [torch.autograd.grad(value.sum(), images)[0] for value in whole]
-        monkeypatch.setattr(f"{psnr.__module__}._BLOCK", 1)  # as few rows as may be
+        monkeypatch.setattr(f"{mean_ssim.__module__}._BLOCK", 1)  # as few rows as may be
         for metric, value, slope in zip(metrics, whole, slopes, strict=True):
             blocks = metric(images, targets)
             assert torch.allclose(blocks, value, rtol=0, atol=1e-11)

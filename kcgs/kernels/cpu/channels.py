@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from numba.core import cgutils
+from kcgs._numba_internals import cgutils
 
 from .simd import SIDE, apply, broadcast, constant, load, long, store, sum_columns
 

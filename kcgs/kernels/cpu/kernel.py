@@ -77,7 +77,7 @@ def _list_pairs(batch: Batch, table: TileTable, order: Any, cutoff: float) -> Cp
     parts, measurement, listing = _list_tasks(count)
     spacing = max_spacing(cutoff)
     loop = partial(measure, batch, table, radius, spacing, order, gaussians, colors, spans, counts)
-    run_tasks(loop, measurement, 1 + count // _THREAD_GAUSSIANS)
+    run_tasks(loop, measurement, count, _THREAD_GAUSSIANS)
     first_terms = empty(count + 1, np.int64)
     first_terms[0] = 0
     np.cumsum(counts, out=first_terms[1:])
@@ -91,8 +91,9 @@ def _list_pairs(batch: Batch, table: TileTable, order: Any, cutoff: float) -> Cp
     with workspace.rest() as room:
         histogram, found = room.empty((parts, copies * blocks), np.int32), room.empty((total, 5), np.int32)
         # the phases of one range follow each other: another thread would only wait
-        threads = min(1 + total // _THREAD_LISTED_PAIRS, parts)
-        run_tasks(partial(list_pairs, batch, radius, spans, found, histogram, lists), listing, threads)
+        work = min(total, (parts - 1) * _THREAD_LISTED_PAIRS)
+        loop = partial(list_pairs, batch, radius, spans, found, histogram, lists)
+        run_tasks(loop, listing, work, _THREAD_LISTED_PAIRS)
     return CpuPlan(lists, workspace)
 
 
@@ -176,4 +177,4 @@ def _visit(lists: Lists, kind: int, backward: Backward, image: Any, nodes: Any, 
     counts = tuple(lists.table.grids[: None if lists.live.any() else 1, TILE_ROWS].tolist())
     tasks = order_tasks(counts, len(image), kind, len(lists.live), len(lists.order))
     loop = partial(sum_rows, lists, backward, borrowed(image), nodes, slopes, terms)
-    run_tasks(loop, tasks, 1 + len(lists.pairs) // _THREAD_PAIRS)
+    run_tasks(loop, tasks, len(lists.pairs), _THREAD_PAIRS)

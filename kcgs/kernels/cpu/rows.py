@@ -22,8 +22,9 @@ from contextlib import contextmanager
 from typing import Any
 
 from numba import types
-from numba.core import cgutils
 from numba.extending import intrinsic
+
+from kcgs._numba_internals import cgutils
 
 from .channels import Channels, Sums
 from .layout import (

@@ -12,10 +12,12 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
 from numba.extending import intrinsic
 
-SIDE = 16  # of a tile
+from kcgs._numba_internals import cgutils
+from kcgs.maps import TILE
+
+SIDE = TILE
 HALF = SIDE // 2  # elements of a vector
 HALVES = 2
 FLOAT = ir.FloatType()

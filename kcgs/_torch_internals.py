@@ -1,20 +1,48 @@
-"""Private names of torch that the operator needs: one function each, and what breaks without it."""
+"""The private names of torch that kcgs uses, each in one function that says what it is for.
+
+`tests/test_private_names.py` lists them with what breaks where torch has one no longer.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch._C._functorch import is_legacy_batchedtensor
+from torch._C._functorch import get_unwrapped, is_functorch_wrapped_tensor, is_legacy_batchedtensor
 from torch._functorch.utils import enable_single_level_autograd_function
 from torch.autograd import forward_ad
+
+
+def assert_async(condition: Tensor, message: str) -> None:
+    """Raise RuntimeError where a 0-dim tensor is false, on CUDA without a host sync, and as a node of a graph."""
+    torch._assert_async(condition, message)
+
+
+def unwrapped(tensor: Tensor) -> Tensor:
+    """Return the tensor inside of the wrappers of `torch.func`: vmap has no rule for assertions."""
+    while is_functorch_wrapped_tensor(tensor):
+        tensor = get_unwrapped(tensor)
+    return tensor
 
 
 def below_autograd(function: Any, *arguments: Any) -> Any:
     """Call a function without autograd; else an operator that its own autograd kernel calls would call that again."""
     with torch._C._AutoDispatchBelowAutograd():
         return function(*arguments)
+
+
+@contextmanager
+def with_autograd() -> Iterator[None]:
+    """Record a graph inside of an operator; else nothing would be, since operators are evaluated below autograd."""
+    keys = torch._C.DispatchKey.AutogradFunctionality, torch._C.DispatchKey.ADInplaceOrView
+    with ExitStack() as stack:
+        for key in keys:
+            stack.enter_context(torch._C._SetExcludeDispatchKeyGuard(key, False))
+        stack.enter_context(torch.enable_grad())
+        yield
 
 
 def is_transforming() -> bool:
