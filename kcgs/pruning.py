@@ -54,7 +54,7 @@ def prune(scene: Scene, tolerance: float = 1e-3, *, cutoff: float = 1e-4, backen
     """
     tolerance = check_number("tolerance", tolerance, 0.0)
     render = RegionSplatRenderer(cutoff=cutoff, backend=backend)
-    if isinstance(scene, Scene) and scene.field.means.ndim == 3:
+    if isinstance(scene, Scene) and scene.num_images is not None:
         return _prune_batch(scene, tolerance, render)
     check_scene(scene)
     total = scene.num_gaussians

@@ -76,6 +76,11 @@ class Scene(nn.Module):
         return self.field.size
 
     @property
+    def num_images(self) -> int | None:
+        """B of a batch; None: one image, without B."""
+        return self.field.num_images
+
+    @property
     def num_gaussians(self) -> int:
         """Number of Gaussians per image."""
         return self.field.num_gaussians
@@ -107,9 +112,9 @@ class Scene(nn.Module):
 
     def __len__(self) -> int:
         """Number of images of a batch; TypeError for a scene of one image."""
-        if self.field.means.ndim == 2:
+        if self.num_images is None:
             raise TypeError("a scene of one image has no len; num_gaussians is the number of its Gaussians")
-        return len(self.field.means)
+        return self.num_images
 
     def __bool__(self) -> bool:
         return True
@@ -176,7 +181,7 @@ class Scene(nn.Module):
         return shorten(f"Scene({self.field.extra_repr()}, {regions}{metadata})")
 
     def _repr_png_(self) -> bytes | None:
-        if self.field.means.ndim != 2:
+        if self.num_images is not None:
             return None
         factor = min(1.0, _NOTEBOOK_SIDE / max(self.size))
         return png(self.render((max(1, round(self.size[0] * factor)), max(1, round(self.size[1] * factor)))))
@@ -219,15 +224,14 @@ def check_type(scene: object, name: str = "scene") -> Scene:
 def check_unbatched(scene: object, name: str = "scene") -> Scene:
     """Return `scene` if it is a Scene of one image."""
     scene = check_type(scene, name)
-    if scene.field.means.ndim != 2:
-        count = len(scene.field.means)
-        raise InvalidArgument(name, "of one image", f"a batch of {count}: scene[t] is one of them")
+    if scene.num_images is not None:
+        raise InvalidArgument(name, "of one image", f"a batch of {scene.num_images}: scene[t] is one of them")
     return scene
 
 
 def check_batch(scenes: object) -> Scene:
     """Return `scenes` if it is a batch of scenes."""
-    if not isinstance(scenes, Scene) or scenes.field.means.ndim != 3:
+    if not isinstance(scenes, Scene) or scenes.num_images is None:
         received = "a scene of one image" if isinstance(scenes, Scene) else type(scenes).__name__
         raise TypeError(f"scenes must be a batch of scenes; got {received}")
     return scenes
@@ -260,7 +264,7 @@ def _check_regions(field: GaussianField, regions: RegionMap | None) -> RegionMap
         return None
     if regions.size != field.size:
         raise ValueError(f"regions must have the size {field.size} of the field; got {regions.size}")
-    images = field.means.shape[0] if field.means.ndim == 3 else 1
+    images = field.num_images or 1
     if regions.num_maps not in (None, 1, images):
         raise ValueError(f"regions must hold 1 map or one for each of {images} images; got {regions.num_maps} maps")
     return regions

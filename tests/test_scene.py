@@ -130,7 +130,7 @@ class TestScene(BaseTester):
         tensors = [torch.ones(*lead, 5, n, device=device) for n in (2, 3, 4)]
         scene = Scene(GaussianField(*tensors, size=SIZE), metadata={"title": "ones"})
         assert scene(size).shape == scene.render(size).shape == (*lead, 4, *(size or SIZE)) and scene(size).any()
-        assert scene.num_gaussians == 5 and scene.size == SIZE and (not lead or len(scene) == lead[0])
+        assert scene.num_gaussians == 5 and scene.size == SIZE and scene.num_images == (lead[0] if lead else None)
 
     def test_feature(self, device: torch.device, dtype: torch.dtype) -> None:
         """Within a hard contour, a scene is what the Gaussians of the region render without a map."""

@@ -64,7 +64,7 @@ def edit(
     hole: dict[str, Any] = {"fill": not no_fill} | _set_options(margin=margin)
     delete_region: Any = partial(editing.delete_region, **hole)
     move_region: Any = partial(editing.move_region, **hole)
-    if edited.field.means.ndim == 3:
+    if edited.num_images is not None:
         exclude("a batch of scenes", no_fill=no_fill or None, margin=margin)
         check_output(output, ".safetensors")
         delete_region, move_region = video.delete_from_video, video.move_in_video

@@ -57,7 +57,7 @@ def render(
     from kcgs.data import save_image
 
     loaded = load(scene)
-    if loaded.field.means.ndim == 3:
+    if loaded.num_images is not None:
         from .video import render_batch
 
         target = target_size(loaded[0], scale, size)
@@ -122,7 +122,7 @@ def info(scene: SceneFile, as_json: Json = False) -> None:
     parts = softness if isinstance(softness, tuple) else (softness,)
     means = [part if isinstance(part, float) else sum(part.values()) / max(1, len(part)) for part in parts]
     report: dict[str, Any] = {
-        "images": loaded.field.means.shape[:-2].numel(),
+        "images": loaded.num_images or 1,
         **describe_scene(loaded),
         "channels": loaded.field.colors.shape[-1],
         "height": loaded.size[0],
@@ -131,7 +131,7 @@ def info(scene: SceneFile, as_json: Json = False) -> None:
         **describe_file(scene, scene.stat().st_size, loaded.size),
         **{f"metadata.{key}": value if as_json else shorten(value) for key, value in loaded.metadata.items()},
     }
-    if loaded.regions is not None and loaded.field.means.ndim == 2:
+    if loaded.regions is not None and loaded.num_images is None:
         table = _describe_regions(loaded)
         if as_json:
             report["table"] = table

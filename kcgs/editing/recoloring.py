@@ -94,7 +94,7 @@ def _recolor(scene: Scene, ids: list[int], gain: Numbers, bias: Numbers | None) 
     members = members_of(field, torch.tensor(ids, device=field.means.device))
     channels = field.colors.shape[-1]
     matrix = _color_tensor("gain", gain, field.colors, [(), (channels,), (channels, channels)])
-    result = field.subset(torch.ones_like(members)) if field.means.ndim == 2 else field[:]
+    result = field.subset(torch.ones_like(members)) if field.num_images is None else field[:]
     with torch.no_grad():
         colors = result.colors[members]
         result.colors[members] = colors @ matrix.T if matrix.ndim == 2 else colors * matrix

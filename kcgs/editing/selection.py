@@ -42,9 +42,9 @@ def select_regions(scene: Scene, region_ids: object) -> Selection:
 
 def select_removable_regions(scene: Scene, region_ids: object) -> Selection:
     """Select regions whose pixels other regions of the map can take over."""
-    if check_type(scene).field.means.ndim == 3:
+    if (count := check_type(scene).num_images) is not None:
         advice = "scene[t] is one of them, and kcgs.video edits regions in all of them"
-        raise InvalidArgument("scene", "of one image", f"a batch of {len(scene.field.means)}: {advice}")
+        raise InvalidArgument("scene", "of one image", f"a batch of {count}: {advice}")
     selection = select_regions(scene, region_ids)
     if selection.regions.is_resampled:
         raise ValueError("scene must not have a resized map: edit the map at its own size, then resize it")

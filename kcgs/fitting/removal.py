@@ -64,7 +64,7 @@ def check_gaussians(
         raise InvalidArgumentType("field", "a GaussianField", type(field).__name__)
     if field.opacities is not None:
         raise InvalidArgument("field", "without opacities", "a field with opacities")
-    map_of_field = regions_of(field.size, regions, field.means.shape[0] if field.means.ndim == 3 else None)
+    map_of_field = regions_of(field.size, regions, field.num_images)
     if (map_of_field is None) != (field.region_ids is None):
         raise InvalidArgument("regions", "given where the field has region ids, and only there", regions)
     return Gaussians.of(field), Renderer(field.size, map_of_field, backend=check_backend(backend))

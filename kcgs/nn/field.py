@@ -100,6 +100,11 @@ class GaussianField(nn.Module):
         return check_ids("region_ids", region_ids, self.means).clone()
 
     @property
+    def num_images(self) -> int | None:
+        """B of a batch; None: one image, without B."""
+        return None if self.means.ndim == 2 else len(self.means)
+
+    @property
     def num_gaussians(self) -> int:
         """Number of Gaussians per image."""
         return self.means.shape[-2]
@@ -173,7 +178,7 @@ class GaussianField(nn.Module):
             >>> field.subset(field.means[:, 0] < 24).num_gaussians < 10
             True
         """
-        if self.means.ndim != 2:
+        if self.num_images is not None:
             raise ValueError(f"subset needs an unbatched field; got means of shape {tuple(self.means.shape)}")
         if check_tensor("mask", mask).dtype == torch.bool:
             if mask.shape != (self.num_gaussians,):
@@ -199,7 +204,7 @@ class GaussianField(nn.Module):
             >>> GaussianField(means, cholesky, colors, size=(8, 8))[-1].means.shape
             torch.Size([9, 2])
         """
-        if self.means.ndim == 2:
+        if self.num_images is None:
             raise ValueError(f"an index needs a batched field; got means of shape {tuple(self.means.shape)}")
         return self._select(index)
 
@@ -223,7 +228,7 @@ class GaussianField(nn.Module):
         for field in fields:
             if not isinstance(field, GaussianField):
                 raise InvalidArgumentType("fields", "GaussianFields", type(field).__name__)
-            if field.means.ndim != 2 or _describe(field) != _describe(fields[0]):
+            if field.num_images is not None or _describe(field) != _describe(fields[0]):
                 expected = f"of one image each and alike, the first with {_describe(fields[0])}"
                 raise InvalidArgument("fields", expected, f"one with {_describe(field)}")
         if not fields:
@@ -343,7 +348,7 @@ class GaussianField(nn.Module):
     def extra_repr(self) -> str:
         """Show the numbers that matter."""
         confined = "confined" if self.region_ids is not None else "not confined"
-        images = f"{len(self.means)} x " if self.means.ndim == 3 else ""
+        images = "" if self.num_images is None else f"{self.num_images} x "
         return f"{images}{self.num_gaussians} Gaussians, {self.colors.shape[-1]} channels, size={self.size}, {confined}"
 
 
