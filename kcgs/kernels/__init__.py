@@ -1,11 +1,11 @@
 """Ways to evaluate the splat and its gradient; private: call `kcgs.functional.region_splat`.
 
-From the name of a backend to its innermost loop: `registry`, then one of four kernels.
+`registry` finds the kernel of a backend:
 
-- `reference`: the sum as it is written.
-- `tiled`: chunks of Gaussians and tiles, plain torch, the gradient by autograd.
-- `cuda`: Triton's programs, which plan, render and gather.
-- `cpu`: its own `lists`, numba's loops, vector code.
+- `reference`: the formula, term by term.
+- `tiled`: chunks of Gaussians and tiles in plain torch; autograd differentiates them.
+- `cuda`: Triton programs, which plan, render and gather.
+- `cpu`: numba loops over `lists` of Gaussians, with vector code.
 
 All take the inputs of `interface`, and share `whitened` coordinates.
 `tiled` and `cuda` share `tiles`; `cpu` evaluates wide Gaussians on `coarse_grids`.

@@ -1,4 +1,4 @@
-"""Loops that find the blocks of coarse grids, and which of them each block is refined from."""
+"""Loops that find the blocks of coarse grids, and the four parents from which each block is refined."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ program = Program("coarse grids")
 
 @program.entry
 def refine(starts, regions, num_regions, maps, grids):
-    """Return the last four of `coarse_grids.Blocks` for the first two of level 0."""
+    """Return starts, regions, parents and parity of `coarse_grids.Blocks` from the starts and regions of level 0."""
     last = grids[len(grids) - 1]
     tile_starts = np.empty(last[FIRST_TILE] + maps * last[TILE_ROWS] * last[TILE_COLS] + 1, np.int64)
     tile_starts[: len(starts)] = starts
     blocks, end = regions, len(regions)
-    tiles = np.full(num_regions, -1)  # the last that holds a region
+    tiles = np.full(num_regions, -1)  # last tile that was found to hold each region
     for level in range(1, len(grids)):
         fine, coarse = grids[level - 1], grids[level]
         for t in range(maps * coarse[TILE_ROWS] * coarse[TILE_COLS]):
@@ -65,7 +65,7 @@ def _place(t, grid):
 
 @inner
 def _find_parents(blocks, tile_starts, tile, parent, parents):
-    """Find the blocks of a tile among those of its parent, which has all their regions."""
+    """Set each block's parent: the block of the same region in the parent tile, which has all regions of the tile."""
     place = tile_starts[parent]
     for block in range(tile_starts[tile], tile_starts[tile + 1]):
         while blocks[place] < blocks[block]:

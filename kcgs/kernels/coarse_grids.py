@@ -1,7 +1,7 @@
-"""Coarse grids for wide Gaussians, which are evaluated at nodes, and carried to the pixels by cubic B-splines.
+"""Coarse grids for wide Gaussians: they are evaluated at nodes, and cubic B-splines carry the values to the pixels.
 
-Level l has nodes 2^l pixels apart, in blocks of 16 x 16 for each region, only where the region has tiles; level 0 are
-the pixels. `cpu` and the ONNX decoders use it; docs/performance.md has the formulas and errors.
+Level l has nodes 2^l pixels apart; level 0 is the pixels. A region has blocks of 16 x 16 nodes where it has tiles.
+`cpu` and the ONNX decoders use these grids; docs/performance.md has the formulas and errors.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Grid(NamedTuple):
 
 
 class Blocks(NamedTuple):
-    """Region of every block, all levels, and the blocks of the next level that each is refined from."""
+    """Blocks of all levels: their regions, and their parents: the blocks of the next level that they refine."""
 
     grids: tuple[Grid, ...]
     starts: Any  # [tiles + 1] int64, first block of each tile, all levels
@@ -44,7 +44,7 @@ class Blocks(NamedTuple):
 
     @property
     def levels(self) -> list[int]:
-        """First block of each level, and the end."""
+        """First block of each level, then the number of blocks."""
         return [*(int(self.starts[grid.first_tile]) for grid in self.grids), len(self.regions)]
 
     @property
@@ -54,17 +54,17 @@ class Blocks(NamedTuple):
 
 
 def max_spacing(cutoff: float) -> float:
-    """Return the largest spacing of nodes that a Gaussian allows, in its smaller standard deviations; 0: none."""
+    """Return the largest spacing of nodes for a Gaussian, in units of its smaller standard deviation; 0: no grid."""
     return min(_SPACING * float(cutoff**0.25), _MAX_SPACING)
 
 
 def grids_of(size: tuple[int, int], maps: int) -> tuple[Grid, ...]:
-    """Return the grids of images of a size, the pixels first."""
+    """Return the grids of images of a size, level 0 first."""
     height, width = size
     grids = [Grid(height, width, -(-height // TILE), -(-width // TILE), 0)]
     while max(height, width) > _COARSEST_SIDE:
         last = grids[-1]
-        # the last pixel, at n - 1/2, needs two nodes after it; node n - 2 the one at its place, and one more
+        # level 1 needs two nodes after the last pixel, at n - 1/2; coarser levels, one after the last node, at n - 2
         is_finest = len(grids) == 1
         height, width = ((n - 1) // 2 + 4 if is_finest else (n - 2) // 2 + 3 for n in (height, width))
         first_tile = last.first_tile + maps * last.rows * last.cols
@@ -73,7 +73,7 @@ def grids_of(size: tuple[int, int], maps: int) -> tuple[Grid, ...]:
 
 
 def make_blocks(starts: Any, regions: Any, num_regions: int, shape: tuple[int, ...]) -> Blocks:
-    """Return the blocks of all levels for the regions of tiles, as of `MapTable`, of maps of a shape (maps, H, W)."""
+    """Return the blocks of all levels from starts and regions of the tiles of a `MapTable`, shape (maps, H, W)."""
     from .blocks import refine  # loads numba
 
     maps, *size = shape
@@ -82,21 +82,22 @@ def make_blocks(starts: Any, regions: Any, num_regions: int, shape: tuple[int, .
 
 
 class Coarsened(NamedTuple):
-    """Gaussians of levels 1 and above as their levels have them, in float64, in nodes."""
+    """Gaussians of levels 1 and above in the coordinates of their levels: float64, lengths in nodes."""
 
     level: Tensor  # [N] int64
     means: Tensor  # [N, 2]
     cholesky: Tensor  # [N, 3]
-    factor: Tensor  # [N] of the colours
+    factor: Tensor  # [N], multiplies the colours
 
 
 def choose_levels(cholesky: Tensor, spacing: float, levels: int) -> Tensor:
     """Return the coarsest of the `levels` whose nodes are close enough for each Gaussian, (N,), from float64 factors.
 
-    They are where (h / s1)^4 + (h / s2)^4 <= spacing^4, with the standard deviations along the axes of the ellipse.
+    Nodes h pixels apart are close enough if (h / s1)^4 + (h / s2)^4 <= spacing^4; s1 and s2 are the standard deviations
+    along the axes of the ellipse, in pixels.
     """
     l11, l21, l22 = cholesky.unbind(-1)
-    # of the variances along the axes: their sum, and their product
+    # sum and product of the variances along the axes
     total, product = l11 * l11 + l21 * l21 + l22 * l22, l11 * l22 * l11 * l22
     bound = spacing**4 * product * product / (total * total - 2 * product)  # of h^4
     powers = torch.tensor([16.0**n for n in range(1, levels)], dtype=bound.dtype, device=bound.device)
@@ -104,7 +105,7 @@ def choose_levels(cholesky: Tensor, spacing: float, levels: int) -> Tensor:
 
 
 def coarsen(level: Tensor, means: Tensor, cholesky: Tensor) -> Coarsened:
-    """Move float64 Gaussians to their levels, none of which is 0."""
+    """Convert float64 Gaussians from pixels to the coordinates of their levels, which are 1 or more."""
     h = (1 << level).double()[:, None]
     l11, l21, l22 = cholesky.unbind(-1)
     variance = h[:, 0] ** 2 / 3

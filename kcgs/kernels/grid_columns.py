@@ -1,6 +1,6 @@
 """The columns of an array of grids, in the order of `coarse_grids.Grid`.
 
-They have a module of their own, since compiled loops that import it are compiled anew when its text changes.
+They have a module of their own, since loops are compiled anew when the text of a module that they import changes.
 """
 
 NODE_ROWS = 0

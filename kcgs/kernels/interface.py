@@ -1,4 +1,4 @@
-"""What a kernel takes and does. Every kernel's module has `kernel_for(inputs)`, which the registry calls."""
+"""Inputs and functions of a kernel. Every kernel's module has `kernel_for(inputs)`, which the registry calls."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class SplatInputs(NamedTuple):
     table: MapTable | None  # of the map at its own size, with positions; None: one region covers everything
     size: tuple[int, int]  # (height, width)
     cutoff: float
-    ids: Tensor | None = None  # [R] int64, sorted: where given, `region_index` holds ids that the kernel looks up
+    ids: Tensor | None = None  # [R] int64, sorted; with them, `region_index` holds ids that the kernel looks up
 
     @property
     def gaussians(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -38,27 +38,27 @@ class SplatInputs(NamedTuple):
         return self.means.shape[0] if self.means.ndim == 3 else 1
 
     def with_batch(self) -> SplatInputs:
-        """Return the same, with B where Gaussians of one image have none."""
+        """Return these inputs with the dimension B, which Gaussians of one image may lack."""
         if self.means.ndim == 3:
             return self
         return SplatInputs(self.means[None], self.cholesky[None], self.colors[None], *self[3:])
 
 
 class Kernel(NamedTuple):
-    """A kernel: three functions that record no graph, and what only some kernels have.
+    """A kernel: three functions that record no graph, and abilities that only some kernels have.
 
-    plan: from the inputs to which Gaussians touch which pixels, in a form of the kernel's own.
-    render: from (plan, inputs) to the image, (B, C, H, W).
-    differentiate: from (plan, inputs, gradient of the image, geometry) to the gradients of means, cholesky and colors;
-        the first two are None unless `geometry`.
-    image: from the inputs to the image, with a graph of all orders; None: the kernel is differentiable once.
-    error_gradients: from (plan, inputs, target) to the gradients of half the squared error against the target,
-        (B, C, H, W), in one pass; None: there is none.
-    checks_values: `plan` returns None where a value is not finite or beyond the limits in whitened.py, and never else;
-        without, values have been checked.
-    takes_one_image: Gaussians of one image may come without B, as do the results then; else B is there.
-    looks_up_regions: `region_index` comes as region ids, with `ids`. `plan` returns None for negative ones, too;
-        `foreign` of the plan is the number of those that the map does not hold.
+    plan: takes the inputs; returns which Gaussians touch which pixels, in the kernel's own format.
+    render: takes (plan, inputs); returns the image, (B, C, H, W).
+    differentiate: takes (plan, inputs, gradient of the image, geometry); returns the gradients of means, cholesky and
+        colors; the first two are None unless `geometry`.
+    image: takes the inputs; returns the image with a graph of all orders. None: the kernel is differentiable once.
+    error_gradients: takes (plan, inputs, target); returns the gradients of half the squared error against the target,
+        (B, C, H, W), in one pass. None: the kernel has no such pass.
+    checks_values: `plan` returns None if, and only if, a value is not finite or beyond the limits in whitened.py.
+        False: the caller has checked the values.
+    takes_one_image: Gaussians of one image may come without B; the results then have no B either. False: B is there.
+    looks_up_regions: `region_index` holds region ids, which the kernel looks up in `ids`. `plan` returns None for
+        negative ids, too; its `foreign` is the number of Gaussians whose id the map does not hold.
     """
 
     plan: Callable[[SplatInputs], Any]

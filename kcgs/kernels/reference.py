@@ -1,6 +1,6 @@
-"""The oracle: the sum as it is written, dense, in any floating dtype, differentiated by autograd.
+"""The oracle: the dense sum of the formula, in any floating dtype, differentiated by autograd.
 
-One region at a time, in chunks of pixels that are recomputed in the backward, so that memory stays flat.
+It sums one region at a time, in chunks of pixels that are recomputed in the backward, so that memory stays flat.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def splat(inputs: SplatInputs) -> Tensor:
 
 
 def _regions(inputs: SplatInputs, b: int) -> Iterator[tuple[Tensor, Tensor | None]]:
-    """Yield the Gaussians of each region of an image and the membership of its pixels, (H * W,); None: 1 everywhere."""
+    """Yield the Gaussians of each region of an image, and the membership of its pixels, (H * W,); None: all 1."""
     table, index = inputs.table, inputs.region_index
     if table is None or index is None:
         yield torch.arange(inputs.means.shape[1], device=inputs.means.device), None
@@ -73,7 +73,7 @@ def _regions(inputs: SplatInputs, b: int) -> Iterator[tuple[Tensor, Tensor | Non
 
 
 def _region_sum(inputs: SplatInputs, gaussians: Sequence[Tensor], pixels: Tensor, membership: Tensor | None) -> Tensor:
-    """Evaluate means, factors and colours (N, ...) of a region at flat pixel indices (P,), which gives (P, C)."""
+    """Return the sum of a region's Gaussians, (N, ...) each tensor, at flat pixel indices (P,): (P, C)."""
     means = gaussians[0]
     x, y = ((v.to(means.dtype) + 0.5) for v in (pixels % inputs.size[1], pixels // inputs.size[1]))
     length = max(1, _CHUNK_WEIGHTS // max(1, len(means)))
@@ -110,7 +110,7 @@ class _ChunkedSum(torch.autograd.Function):
 def _dense_sum(x: Tensor, y: Tensor, membership: Tensor | None, gaussians: Sequence[Tensor], cutoff: float) -> Tensor:
     means, cholesky, colors = gaussians
     l11, l21, l22 = cholesky.unbind(-1)
-    # far beyond any weight that is not zero, and squares stay finite: no inf * 0 in the backward
+    # the limit is far beyond every weight that is not zero, and its square is finite: no inf * 0 in the backward
     z1 = ((x[:, None] - means[:, 0]) / l11).clamp(-Z_LIMIT, Z_LIMIT)  # [P, N]
     z2 = ((y[:, None] - means[:, 1] - l21 * z1) / l22).clamp(-Z_LIMIT, Z_LIMIT)
     weight = torch.exp(-0.5 * (z1 * z1 + z2 * z2))

@@ -1,4 +1,4 @@
-"""From the name of a backend to its kernel, and what "auto" picks; the operator in functional calls it."""
+"""The kernel of each backend, and of "auto"; the operator in `functional` looks it up here."""
 
 from __future__ import annotations
 
@@ -74,14 +74,14 @@ def _compiles(device: torch.device) -> bool:
 
 
 def takes_triton(*tensors: Tensor) -> bool:
-    """True where programs of Triton may change tensors: float32, contiguous, on a device that they compile for."""
+    """Return whether Triton programs can update these tensors: float32, contiguous, on a device they compile for."""
     return not torch.compiler.is_compiling() and all(
         t.is_cuda and t.dtype is torch.float32 and t.is_contiguous() and _compiles(t.device) for t in tensors
     )
 
 
 def check_backend(backend: str) -> str:
-    """Return `backend` if it is a name of one."""
+    """Return `backend`; raise an InvalidArgument if no backend has this name."""
     if backend not in BACKENDS:
         raise InvalidArgument("backend", f"one of {', '.join(BACKENDS)}", repr(backend))
     return backend

@@ -32,16 +32,16 @@ from .tiles import (
 )
 from .whitened import least_exponent, sums_to_gradients, support_radius
 
-# pairs of a piece: more would pad most pieces, fewer would sum more of them
+# pairs per piece: longer pieces would be mostly padding, shorter pieces would be more pieces to sum
 _PIECE = 16
-# pieces of a chunk: weights of 2 MiB in float32, more would leave the caches
+# pieces per chunk: their weights are 2 MiB in float32, more would leave the caches
 _CHUNK = 128
 
 
 class _Plan(NamedTuple):
-    """The (Gaussian, tile) pairs that may give a weight, and pieces: pairs of one block, a tile and a region in it.
+    """The (Gaussian, tile) pairs whose weight may not be zero, and pieces: pairs of one tile and one region.
 
-    Since no piece has two regions, what one region holds changes no bit of another.
+    Since no piece has two regions, the Gaussians of one region change no bit of another.
     """
 
     gaussian: Tensor  # [P] int64, b * N + i, ascending
@@ -49,11 +49,11 @@ class _Plan(NamedTuple):
     pieces: Tensor  # [S, _PIECE] int64 into the pairs, padded with -1
     tile: Tensor  # [S] int64, ascending
     mask_rows: Tensor  # [S] int32 into masks
-    masks: Tensor  # [K + 1, 256], in the dtype of the inputs; the last, of ones, is -1
+    masks: Tensor  # [K + 1, 256], in the dtype of the inputs; the last row, at index -1, is all ones
 
 
 class _Chunk(NamedTuple):
-    """What some pieces are evaluated from."""
+    """The inputs of some pieces."""
 
     pieces: Tensor  # [T, _PIECE] int64
     tile: Tensor  # [T] int64
@@ -85,7 +85,7 @@ def _make_plan(inputs: SplatInputs) -> _Plan:
 
 
 def _tile_regions(inputs: SplatInputs) -> tuple[Tensor, Tensor, Tensor, Tensor, int]:
-    """Return the tiles of the map, and the number of regions; without a map, one is everywhere."""
+    """Return the tiles of the map, and the number of regions; without a map, one region covers everything."""
     if inputs.table is not None:
         return *table_at(inputs.table, inputs.size).tiles, inputs.table.num_regions
     grid = grid_of(inputs)
@@ -95,7 +95,7 @@ def _tile_regions(inputs: SplatInputs) -> tuple[Tensor, Tensor, Tensor, Tensor, 
 
 
 def keys_of(starts: Tensor, regions: Tensor, num_regions: int) -> Tensor:
-    """Return tile * num_regions + region of each entry, which ascend."""
+    """Return the key tile * num_regions + region of each entry; keys ascend."""
     return torch.repeat_interleave(starts.diff()) * num_regions + regions
 
 
@@ -129,11 +129,11 @@ def _evaluate(chunk: _Chunk, cutoff: float) -> Tensor:
     """Sum the Gaussians of each piece over its tile, (T, C, 256)."""
     k0, k1, k2, k3, k4 = chunk.coefficients[..., None, None].unbind(2)
     offset = torch.arange(TILE, device=k0.device, dtype=k0.dtype) - (TILE - 1) / 2
-    # element by element: a matrix product may be of less precision on a GPU, as the user has set it
+    # element by element, since users may set a lower precision for matrix products on a GPU
     z1 = k0 + k1 * offset  # [T, _PIECE, 1, 16]
     z2 = k2 + k4 * offset[:, None] + k3 * offset  # [T, _PIECE, 16, 16]
     least = least_exponent(cutoff, k0.dtype)
-    # exp() is slow where its result is no normal number, and `threshold` faster than `where`
+    # exp() is slow where its result is no normal number, and `threshold` is faster than `where`
     exponent = threshold(-0.5 * (z1.square() + z2.square()), least - 1, least - 1)
     weight = threshold(exponent.exp(), math.exp(least), 0.0)
     return chunk.colors.mT @ weight.flatten(2) * chunk.masks
@@ -145,7 +145,7 @@ def _render(plan: _Plan, inputs: SplatInputs) -> Tensor:
     for chunk in _chunks(plan, inputs):
         values = _evaluate(chunk, inputs.cutoff).flatten(1)
         tile, counts = torch.unique_consecutive(chunk.tile, return_counts=True)
-        # pieces are added one after the other, wherever a chunk ends: the bits do not depend on that
+        # pieces of a tile are added one after the other, also across chunks: the bits do not depend on the chunks
         values[counts.cumsum(0) - counts] += tiles[tile]
         tiles[tile] = sum_runs(values, counts)
     return join_tiles(tiles.view(*grid, channels, TILE, TILE), inputs.size)

@@ -1,4 +1,4 @@
-"""Tiles of 16 x 16 pixels, and which Gaussian touches which; for `tiled`, `cuda` and the ONNX decoders."""
+"""Tiles of 16 x 16 pixels, and which Gaussian touches which tile; for `tiled`, `cuda` and the ONNX decoders."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from kcgs.maps import TILE
 from .interface import SplatInputs
 from .whitened import Z_LIMIT, affine_coefficients, least_shear
 
-# by which bounds of a support exceed it, so that they hold for weights in float32: a share, and pixels
+# margins of the bounds of a support, so that they hold for weights in float32: relative, and in pixels
 RELATIVE_MARGIN = 1e-5
 MARGIN = 1e-3
 
@@ -46,7 +46,7 @@ def bounding_tiles(
         cholesky: (N, 3) pixels.
         radius: of the support, in standard deviations.
         size: of the image.
-        between: whether to touch is to hold any point of a tile, rather than the centre of one of its pixels.
+        between: whether a box touches a tile if it holds any point of it, rather than the centre of a pixel.
 
     Returns:
         Ordered by Gaussian: its index (P,), the tile's column and row (P, 2), the tile's centre minus the mean (P, 2).
@@ -78,7 +78,7 @@ def reaches(origin: Tensor, cholesky: Tensor, radius: float) -> Tensor:
 
 
 def find_keys(keys: Tensor, tile: Tensor, region: Tensor, num_regions: int) -> tuple[Tensor, Tensor]:
-    """Return the position of tile * num_regions + region among sorted keys, and whether it is there; not for -1."""
+    """Return the place of tile * num_regions + region among sorted keys, and if it is there; region -1 never is."""
     key = torch.where(region >= 0, tile * num_regions + region, -1)
     position = torch.searchsorted(keys, key).clamp_max(len(keys) - 1)
     return position, keys[position] == key
@@ -106,13 +106,13 @@ def join_tiles(tiles: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def expand_runs(counts: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the number of the run and the position in it of each member of consecutive runs of these lengths."""
+    """Return, for each member of consecutive runs of these lengths, the number of its run and its position in it."""
     run = torch.repeat_interleave(counts)
     return run, torch.arange(len(run), device=run.device) - (counts.cumsum(0) - counts)[run]
 
 
 def sum_runs(values: Tensor, counts: Tensor) -> Tensor:
-    """Sum consecutive runs of rows: the same order of addition every time, on any device."""
+    """Sum consecutive runs of rows; the order of addition is the same every time, on any device."""
     if len(counts) == 0:
         return values.new_zeros(0, values.shape[-1])
     return torch.segment_reduce(values, "sum", lengths=counts, axis=0, initial=0.0)

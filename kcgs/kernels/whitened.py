@@ -15,26 +15,26 @@ from kcgs._arithmetic import Numbers
 
 from .interface import Gradients
 
-# whitened coordinates times this, squared, are an exponent of 2
+# if z is multiplied by this, the weight exp(-|z|^2 / 2) is 2^(-|z|^2)
 SCALE = math.sqrt(0.5 / math.log(2.0))
 
-# |z| is cut here, where every weight is zero: its square is still finite in float32
+# |z| is clamped here, where every weight is zero: its square is still finite in float32
 Z_LIMIT = 1e15
 
 # largest coordinate of a mean, in pixels: arithmetic in float32 stays finite
 MEAN_LIMIT = 1e8
 # least and largest l11 and l22, in pixels, for the same reason
 SCALE_LIMITS = (1e-6, 1e8)
-# by which the least may be missed, as numbers are rounded; and that bound for float32, as which all checks compare
+# relative tolerance of the least scale, for rounding; and the least scale with it in float32, which all checks use
 SCALE_TOLERANCE = 1e-6
 LEAST_SCALE = float(np.float32(SCALE_LIMITS[0] * (1 - SCALE_TOLERANCE)))
 
-# by the bytes of the dtype; exp() of less is zero there, or nothing beside the smallest colour step
+# by the bytes of the dtype: exp() of a smaller exponent is zero, or far below the smallest colour step
 _LEAST_EXPONENT = {4: -80.0, 8: -700.0}
 
 
 def least_exponent(cutoff: float, dtype: torch.dtype) -> float:
-    """Return the exponent below which a weight is 0; at cutoff 0 where exp() turns slow, and zero in the dtype."""
+    """Return the exponent below which a weight is 0: log(cutoff), or the limit of the dtype where that is larger."""
     least = _LEAST_EXPONENT[dtype.itemsize]
     return max(math.log(cutoff), least) if cutoff > 0.0 else least
 
@@ -52,7 +52,7 @@ def whiten(x: Numbers, y: Numbers, k1: Numbers, slope: Numbers, k2: Numbers) -> 
 def affine_coefficients(
     x: Numbers, y: Numbers, l11: Numbers, l21: Numbers, l22: Numbers
 ) -> tuple[Numbers, Numbers, Numbers, Numbers, Numbers]:
-    """Return k of z1 = k0 + k1 u, z2 = k2 + k3 u + k4 v, for pixels at (u, v) from a point at (x, y) from the mean."""
+    """Return k of z1 = k0 + k1 u, z2 = k2 + k3 u + k4 v, for (u, v) from a point that is (x, y) from the mean."""
     slope = l21 / l11
     k0, k1, k4 = x / l11, l11.reciprocal(), l22.reciprocal()
     k2 = (y - slope * x) / l22
@@ -60,9 +60,9 @@ def affine_coefficients(
 
 
 def least_shear(x: Numbers, y: Numbers, slope: Numbers, half: float) -> Numbers:
-    """Return the least |y - slope x| over a square, from its middle; below 0 where the square has points of both signs.
+    """Return the least |y - slope x| over a square with middle (x, y); below 0 where y - slope x has both signs.
 
-    A slanted needle is thin in z2: few of the squares that its bounding box touches come close.
+    The support of a slanted needle is thin in z2: it reaches few of the squares that its bounding box touches.
     """
     return (y - slope * x).abs() - (slope.abs() + 1) * half
 
@@ -70,15 +70,15 @@ def least_shear(x: Numbers, y: Numbers, slope: Numbers, half: float) -> Numbers:
 def least_whitened(
     x: Numbers, y: Numbers, k1: Numbers, slope: Numbers, k2: Numbers, half: float
 ) -> tuple[Numbers, Numbers]:
-    """Return the least |z1| and |z2| over a square, from its middle and half its side; below 0 where both signs are."""
+    """Return the least |z1| and |z2| over a square with middle (x, y); below 0 where a coordinate has both signs."""
     return (x.abs() - half) * k1, least_shear(x, y, slope, half) * k2
 
 
 def sums_to_gradients(sums: Tensor, channels: int, cholesky: Tensor) -> Gradients:
     """Turn sums over the pixels into gradients of means, factors and colours.
 
-    With g = dLoss/dI and v = w g^T c the sums are of w g, (..., C), or of these and of v (z1, z2, z1 z1, z1 z2, z2 z2),
-    (..., C + 5). Without the latter, means and factors have no gradient: None.
+    With g = dLoss/dI and v = w g^T c the sums are of w g, (..., C), or of w g and of v (z1, z2, z1 z1, z1 z2, z2 z2),
+    (..., C + 5). From w g alone, the gradients of means and factors are None.
     """
     colors = sums[..., :channels]
     if sums.shape[-1] == channels:

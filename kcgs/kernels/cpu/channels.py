@@ -9,8 +9,9 @@ from kcgs._numba_internals import cgutils
 
 from .simd import SIDE, apply, broadcast, constant, load, long, store, sum_columns
 
-# sums over rows, of v, v z2 and v z2 z2, and what follows from them over columns
+# number of sums over rows: of v, v z2, v z2 z2
 _MOMENTS = 3
+# number of sums over rows and columns: of v z1, v z2, v z1 z1, v z1 z2, v z2 z2
 _TERMS = 5
 
 
@@ -21,7 +22,7 @@ class Channels:
         self.builder, self.colors, self.count, self.is_rgb = builder, colors, count, is_rgb
 
     def each(self, emit: Callable[[Any, Any], None], pixels: Any) -> None:
-        """Call emit(channel, pointer to its pixels), within a loop or for each of three."""
+        """Call emit(channel, pointer to its pixels) in a loop over channels, or three times for RGB."""
 
         def visit(channel: Any) -> None:
             emit(channel, self.builder.gep(pixels, [self.builder.mul(channel, long(SIDE))]))
@@ -50,7 +51,7 @@ class Channels:
 class Sums:
     """Sums over rows and columns: w g_c of each channel, then the moments of v = w sum_c g_c colors_c.
 
-    `room` has a vector for each; within half a row three channels and the moments are summed in registers.
+    `room` has a vector for each sum. Within half of the columns, registers hold the sums of RGB and the moments.
     """
 
     def __init__(self, channels: Channels, room: Any) -> None:
@@ -61,7 +62,7 @@ class Sums:
         self.totals = [cgutils.alloca_once(builder, zero.type) for _ in range(3 if channels.is_rgb else 0)]
         self.moments = [cgutils.alloca_once(builder, zero.type) for _ in range(_MOMENTS)]
         self.count = long(3 + _TERMS) if channels.is_rgb else builder.add(channels.count, long(_TERMS))
-        # in eights, as they are summed, and since LLVM would call memset for a loop over single ones
+        # eight vectors at a time, as in `finish`: LLVM would turn a loop over single vectors into a call of memset
         with cgutils.for_range_slice(builder, long(0), self.count, long(8)) as (first, _):
             for k in range(8):
                 store(builder, zero, room, builder.add(first, long(k)))
@@ -72,7 +73,7 @@ class Sums:
             self.builder.store(constant(0.0), total)
 
     def gather(self, weight: Any, pixels: Any, second: Any) -> None:
-        """Add the terms of a row of pixels of that weight and z2."""
+        """Add the terms of a row of pixels, whose z2 is `second`."""
         builder = self.builder
         # -0.0 added changes nothing, not even the sign of a zero
         product = cgutils.alloca_once_value(builder, constant(-0.0))

@@ -1,6 +1,6 @@
 """Bounds of a Gaussian's support: the tiles, and within a tile the rows, that its ellipse |z| <= radius crosses.
 
-`g` is a row of Lists.gaussians, the height and width are of its level's grid, all in nodes.
+`g` is a row of Lists.gaussians; `height` and `width` are the size of its level's grid; lengths are in nodes.
 """
 
 from __future__ import annotations
@@ -59,9 +59,9 @@ def row_halves(g, row, height, width, radius):
     """Return the halves of tiles, first and last + 1, that the ellipse may cross in a row of tiles."""
     spread = g[L11] * radius + _MARGIN
     first, last = max(g[MEAN_X] - spread - 0.5, 0.0), min(g[MEAN_X] + spread - 0.5, width - 1.0)
-    if last - first < SIDE:  # block_rows finds out more for less
+    if last - first < SIDE:  # block_rows has tighter bounds at less cost
         return (int(first) // HALF, int(last) // HALF + 1) if first <= last else (0, 0)
-    # by the factor of (y, x), whose first standard deviation is that along y
+    # the Cholesky factor of (y, x) begins with the standard deviation along y
     sigma = g[SIGMA_Y]
     top = max((row * SIDE + 0.5 - _MARGIN - g[MEAN_Y]) / sigma, -radius)
     bottom = min((min(row * SIDE + SIDE, height) - 0.5 + _MARGIN - g[MEAN_Y]) / sigma, radius)
@@ -92,7 +92,7 @@ def block_rows(g, row, col, height, width, radius):
 def enter(g, row, col, first, shape):
     """Set `shape`, float32, to k of z1 = k0 + k1 x and z2 = k2 + k3 x + k4 y, to CHANGE, and to y of the first row.
 
-    z is times SCALE; x and y are counted from the block's middle.
+    z is multiplied by SCALE; x and y are nodes from the block's middle.
     """
     x, y = col * SIDE + SIDE / 2 - g[MEAN_X], row * SIDE + SIDE / 2 - g[MEAN_Y]
     shape[0] = bounded(g[SLOPE1_X] * x)

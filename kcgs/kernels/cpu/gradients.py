@@ -13,7 +13,7 @@ from .layout import COLOR_FACTOR, L11, L21, L22, LEVEL
 
 
 class Backward(NamedTuple):
-    """What `sum_terms` needs and fills, in the caller's order."""
+    """Arrays that `sum_terms` reads and fills, in the caller's order of Gaussians."""
 
     factors: Any  # [N, 3] float32, Cholesky factors
     means_gradient: Any  # [N, 2] float32
@@ -23,14 +23,14 @@ class Backward(NamedTuple):
 
 @inner
 def sum_terms(lists, backward, terms, begin, end):
-    """Add up the terms of some Gaussians in float64 and turn them into gradients; docs/performance.md has the formulas.
+    """Sum the terms of some Gaussians in float64 and turn them into gradients; docs/performance.md has formulas.
 
     Args:
         lists: Lists.
         backward: Backward.
         terms: (P, ...) float32, as loops.sum_rows fills them.
         begin: the first Gaussian, in the lists' order.
-        end: the last one + 1.
+        end: the last Gaussian + 1.
     """
     channels = backward.colors_gradient.shape[1]
     t, mean, factor = np.empty(terms.shape[1]), np.empty(2), np.empty(3)
@@ -59,7 +59,7 @@ def sum_terms(lists, backward, terms, begin, end):
 
 @inner
 def _uncoarsen(g, fine, mean, factor, by_factor):
-    """Turn the gradients of a mean and a factor on their level into those in pixels, back through coarse_grids.coarsen.
+    """Convert the gradients of a mean and a factor from nodes to pixels: the backward of coarse_grids.coarsen.
 
     `fine` is the factor in pixels, `by_factor` the gradient of COLOR_FACTOR.
     """

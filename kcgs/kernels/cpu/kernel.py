@@ -26,10 +26,10 @@ from .loops import sum_rows
 from .schedule import ADDS, GATHERS, order_tasks
 from .simd import SIDE
 
-# Gaussians that one task lists, at least, and tasks at most
+# least Gaussians per task that lists them, and most tasks
 _PART = 128
 _MOST_PARTS = 16
-# Gaussians to measure, and pairs to list and to visit, for which another thread is woken
+# another thread is woken for so many Gaussians to measure, pairs to list, and pairs to visit
 _THREAD_GAUSSIANS = 2048
 _THREAD_LISTED_PAIRS = 3000
 _THREAD_PAIRS = 300
@@ -39,11 +39,11 @@ class CpuPlan(NamedTuple):
     """The lists of a render, and the memory that they are in."""
 
     lists: Lists
-    workspace: Workspace  # no thread but the caller's holds it, so that it is back when the caller is done
+    workspace: Workspace  # only the caller's thread holds it: its memory returns when the caller is done
 
 
 def kernel_for(inputs: SplatInputs) -> Kernel:
-    """Return the kernel, if it takes these inputs."""
+    """Return the kernel; raise a ValueError for inputs that it does not take."""
     if inputs.means.dtype != torch.float32:
         raise ValueError(f"backend 'cpu' computes in float32; got {inputs.means.dtype}: use 'tiled' or 'reference'")
     if inputs.means.device.type != "cpu":
@@ -99,13 +99,13 @@ def _list_pairs(batch: Batch, table: TileTable, order: Any, cutoff: float) -> Cp
 
 @functools.lru_cache(maxsize=64)
 def _list_tasks(count: int) -> tuple[int, Any, Any]:
-    """Return the number of ranges of so many Gaussians, and the tasks of `measure` and `list_pairs`."""
+    """Return the number of ranges of `count` Gaussians, and the tasks of `measure` and `list_pairs`."""
     parts = chunks(count, _PART, _MOST_PARTS)
     return len(parts), phases(parts), phases(parts, np.zeros((1, 2), np.int64), parts)
 
 
 def _array(tensor: Tensor) -> Any:
-    # contiguous, since every other layout would be compiled for
+    # contiguous, since numba would compile the loops again for every other layout
     return tensor.detach().resolve_neg().reshape(-1, tensor.shape[-1]).contiguous().numpy()
 
 
@@ -114,7 +114,7 @@ def _table_of(table: MapTable) -> TileTable:
     return _make_table(starts, regions, planes.astype(np.int64), weights.ravel(), table.num_regions, table.shape)
 
 
-# contour moves render each region alone, in the size of its box
+# contour moves render each region alone, at the size of its bounding box: many sizes
 @functools.lru_cache(maxsize=256)
 def _table_without_map(size: tuple[int, int]) -> TileTable:
     tiles = -(-size[0] // SIDE) * -(-size[1] // SIDE)
@@ -132,7 +132,7 @@ def _make_table(
 def render(plan: CpuPlan, inputs: SplatInputs) -> Tensor:
     """Render (B, C, H, W)."""
     *batch, _, channels = inputs.colors.shape
-    # numpy asks for huge pages where an array is large: first use costs a quarter of what torch.empty's does
+    # numpy asks for huge pages for a large array: its first use takes a quarter of the time of torch.empty's
     image = np.empty((*batch, channels, *inputs.size), np.float32)
     nothing = np.empty((0, 3), np.float32)
     backward = Backward(nothing, nothing, nothing, nothing)

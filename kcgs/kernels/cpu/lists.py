@@ -1,4 +1,4 @@
-"""The lists of the CPU kernel: the table of Gaussians, and which of them touch each block of pixels or nodes."""
+"""The lists of the CPU kernel: the table of Gaussians, and the Gaussians that touch each block of pixels or nodes."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ _NORMAL_RADIUS = 13.1
 
 @program.entry
 def arrange(batch, rows, cols):
-    """Return whether all is finite and within the limits of whitened.py, and if so the `order` of Lists.
+    """Return whether all values are finite and within the limits of whitened.py, and if so the `order` of Lists.
 
     Args:
         batch: Batch.
-        rows: of tiles of an image.
-        cols: the same.
+        rows: rows of tiles per image.
+        cols: columns of tiles per image.
     """
     means, per_image = batch.means, max(len(batch.means) // batch.num_images, 1)
     order = np.empty(len(means), np.int64)
@@ -86,18 +86,18 @@ def _in_range(means, cholesky, colors):
 
 @program.entry
 def measure(batch, table, radius, spacing, order, gaussians, colors, spans, counts, tasks, counters):
-    """Fill gaussians and colors of Lists, the rows of blocks that each Gaussian may touch, and how many blocks.
+    """Fill gaussians and colors of Lists, and for each Gaussian the rows and the number of blocks that it may touch.
 
     Args:
         batch: Batch.
         table: TileTable.
         radius: the largest |z| of a weight.
-        spacing: of nodes in standard deviations, see coarse_grids.
+        spacing: largest spacing of nodes, in standard deviations, see coarse_grids.
         order: see Lists.
         gaussians: see there.
         colors: see there.
         spans: (N, 2) int32, first row and last + 1.
-        counts: (N,) int64, at least the number of blocks.
+        counts: (N,) int64, upper bounds of the number of blocks.
         tasks: ranges of Gaussians, see `tasks.py`.
         counters: see there.
     """
@@ -128,10 +128,10 @@ def list_pairs(batch, radius, spans, blocks, histogram, lists, tasks, counters):
     Args:
         batch: Batch.
         radius: the largest |z| of a weight.
-        spans: as `measure` returns them.
+        spans: as `measure` fills them.
         blocks: (P, 5) int32, room for the block, rows and halves of each pair, by Gaussian.
-        histogram: (T, copies * K) int32, room for a number of each block.
-        lists: Lists, of which first_terms has the sums of `counts`.
+        histogram: (T, copies * K) int32, room for the number of pairs of each block, per range of Gaussians.
+        lists: Lists; its first_terms are the cumulative sums of `counts`.
         tasks: ranges of Gaussians, then the sum over all, then the ranges once more; see `tasks.py`.
         counters: see there.
     """
@@ -177,9 +177,9 @@ def _find_blocks(batch, radius, spans, blocks, histogram, lists, begin, end):
 
 @inner
 def _sum_histogram(histogram, lists):
-    """Turn numbers of pairs into places of the first, set `start`, and mark the blocks of nodes that are not zero."""
+    """Turn numbers of pairs into the places of their first pairs, set `start`, and mark live blocks of nodes."""
     table, start, live = lists.table, lists.start, lists.live
-    # along rows of the histogram, which are vectors
+    # the inner loop follows a row of the histogram, so that it is vectorised
     start[:] = 0
     for part in range(len(histogram)):
         for head in range(len(start) - 1):
@@ -236,9 +236,10 @@ def _fill(g, mean, cholesky, levels, spacing):
 def _coarsen(g, spacing, levels):
     """Move a Gaussian to its level.
 
-    coarse_grids.choose_levels and coarsen in scalars, since numba compiles no torch; test_coarse_grids compares them.
+    It repeats coarse_grids.choose_levels and coarsen in scalars, since numba compiles no torch; test_coarse_grids
+    compares them.
     """
-    # of the variances along the axes of the ellipse: their sum, and their product
+    # sum and product of the variances along the axes of the ellipse
     total, product = g[L11] * g[L11] + g[L21] * g[L21] + g[L22] * g[L22], g[L11] * g[L22] * g[L11] * g[L22]
     spacing *= spacing
     bound = spacing * spacing * product * product / (total * total - 2 * product)  # of h^4
@@ -261,7 +262,7 @@ def _coarsen(g, spacing, levels):
 
 @inline
 def find_block(num_regions, tile_start, regions, tile, region):
-    """Return the position of a region's block in a tile, or -1; takes arrays, since to pass on a TileTable is slow."""
+    """Return the position of a region's block in a tile, or -1; it takes arrays: passing a TileTable is slow."""
     if num_regions == 1:
         return tile
     low, high = tile_start[tile], tile_start[tile + 1]

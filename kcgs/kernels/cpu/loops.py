@@ -2,8 +2,8 @@
 
 A block, 16 x 16 pixels or nodes of a coarse grid, stays in the processor's cache while all of its Gaussians are added
 or gathered. Within it only the rows that the ellipse crosses are visited. Wide Gaussians are evaluated in blocks of
-nodes, which are refined from level to level and sampled at the pixels. A row of blocks is one task, and every sum has
-an order of its own, so the result does not depend on the number of threads. A block lies in memory as
+nodes, which are refined from level to level and sampled at the pixels. A row of blocks is one task, and every sum has a
+fixed order, so the result does not depend on the number of threads. A block lies in memory as
 [SIDE rows][channel][SIDE columns].
 """
 
@@ -32,12 +32,12 @@ def sum_rows(lists, backward, image, nodes, slopes, terms, tasks, counters):
 
     Args:
         lists: Lists.
-        backward: gradients.Backward; of no Gaussians where tasks add only.
-        image: (B, C, H, W) float32: what tasks that add fill, the gradient where they gather, the target where they do
-            both, of which the gradient is what they added minus that.
+        backward: gradients.Backward; empty where tasks only add.
+        image: (B, C, H, W) float32. Tasks that only add write it; tasks that only gather read it as the gradient; for
+            tasks that do both it is the target, and the gradient is the sum of the Gaussians minus the target.
         nodes: float32, room for the blocks of all coarse grids; empty where no Gaussian is wide.
-        slopes: float32, room for the gradients of the nodes; empty likewise, or where tasks add only.
-        terms: (P, C + 5, rounded up to a multiple of 8) float32, of which each pair's is set: w g of each channel,
+        slopes: float32, room for the gradients of the nodes; empty where no Gaussian is wide, or where tasks only add.
+        terms: (P, C + 5, rounded up to a multiple of 8) float32, a row per pair, which is set: w g of each channel,
             then v (z1, z2, z1 z1, z1 z2, z2 z2) with z times SCALE, see whitened.sums_to_gradients.
         tasks: see schedule.py.
         counters: see tasks.py.
@@ -63,7 +63,7 @@ def sum_rows(lists, backward, image, nodes, slopes, terms, tasks, counters):
 
 @inner
 def _clear(lists, grid, size, first, end):
-    """Set blocks of nodes to zero: the live ones, and the last of each copy, which stands for those that are not."""
+    """Set the live blocks of nodes to zero, and the last block of each copy, which stands for blocks not live."""
     copy = len(lists.table.parents) - len(lists.table.mask_rows) + 1
     for block in range(first, end if len(grid) > 0 else first):
         if lists.live[block] or (block + 1) % copy == 0:
@@ -113,7 +113,7 @@ def _visit_row(lists, task, image, pixels, nodes, slopes, terms, sums, offsets, 
 
 
 def _make_spline(refine: Any, sample: Any) -> Any:
-    """Make the step between a block and its parents, by one function for nodes and another for pixels."""
+    """Make the loop between a block and its parents: `refine` for blocks of nodes, `sample` for blocks of pixels."""
 
     @inner
     def visit_spline(coarse, offsets, parity, level, fine, origin, channels, weights, first, step):
@@ -132,7 +132,7 @@ _gather_spline = _make_spline(gather_refined, gather_sampled)
 
 @inner
 def _exchange(image, pixels, b, top, left, adds, gathers):
-    """Copy a block to an image (if it adds), from there (if it gathers), or subtract that; outside it is zero."""
+    """Copy a block to an image (adds) or from it (gathers), or subtract the image (both); outside it is zero."""
     channels, height, width = image.shape[1:]
     rows, cols = min(SIDE, height - top), min(SIDE, width - left)
     if gathers and (rows < SIDE or cols < SIDE):
@@ -148,7 +148,7 @@ def _exchange(image, pixels, b, top, left, adds, gathers):
 
 @inner
 def _mask(mask_rows, masks, ones, block, level):
-    """Return the membership of a block's pixels: array, first element, and step from row to row; step 0: all are 1."""
+    """Return the membership of a block's pixels: array, first element, and step between rows; step 0: all are 1."""
     if level > 0 or mask_rows[block] < 0:
         return ones, 0, 0
     return masks, mask_rows[block] * SIDE * SIDE, SIDE
@@ -156,7 +156,7 @@ def _mask(mask_rows, masks, ones, block, level):
 
 @inner
 def _set_offsets(live, parents, block, base, size, offsets):
-    """Set the offsets of a block's parents, of `size` elements each; return whether one is live."""
+    """Set the offsets of a block's parents, of `size` elements each; return whether any parent is live."""
     is_live = False
     for k in range(4):
         parent = base + parents[block, k]

@@ -1,18 +1,17 @@
 """Vector code over the rows of a block that a Gaussian touches: it adds the Gaussian, or gathers its gradients.
 
 Along a column the weight follows from row to row by two products, w <- w g and g <- g c, since its exponent is a
-polynomial of degree two. What is stored is g - 1 and c - 1, which are small where a Gaussian is wide: so errors do not
-grow along a run. Exponentials begin a run of rows, which is so short that no weight within the ellipse underflows on
-the way; the rows of a thin Gaussian begin a run each. The two halves of the columns follow each other, if the Gaussian
-touches both.
+polynomial of degree two. The code stores g - 1 and c - 1, which are small where a Gaussian is wide, so that errors do
+not grow. Each run of rows begins with exponentials, and is so short that no weight within the ellipse underflows; each
+row of a thin Gaussian is a run. The loop visits the left half of the columns first, then the right half.
 
 Arguments in common:
 
 - pixels, origin: float32 array, and the first element of the block, [SIDE rows][channel][SIDE columns];
 - channels: their number;
-- pairs, number: Lists.pairs, and which of them;
+- pairs, number: Lists.pairs, and the row of the pair;
 - shapes, colors, cutoff: see Lists;
-- masks, mask_start: float32 array of membership, and the block's first element, below 0 if there is none.
+- masks, mask_start: float32 array of membership, and the block's first element, negative for a block without a mask.
 """
 
 from __future__ import annotations
@@ -56,7 +55,7 @@ from .simd import (
     ramp,
 )
 
-# exponents of 2 below which a weight is zero, and of which a ratio of weights is cut
+# a weight below 2^_LEAST is zero, and a ratio of weights is at most 2^-_LEAST
 _LEAST = -126.0
 
 
@@ -104,7 +103,7 @@ class _Rows:
         builder = self.builder
         with cgutils.for_range_slice(builder, self.first_half, self.end_half, long(1)) as (half, _):
             k = self.shape
-            # not converted from integers: a conversion waits for the register that the loop before used last
+            # constants, since a conversion from integers waits for the register that the previous loop used last
             columns = builder.select(builder.icmp_signed("==", half, long(0)), ramp(0), ramp(1))
             self.z1 = apply(builder, "fma", k[1], columns, k[0])
             self.negative = builder.fneg(builder.fmul(self.z1, self.z1))
@@ -140,7 +139,7 @@ class _Rows:
         return apply(self.builder, "fma", self.slope, y, self.base)
 
     def _begin(self, second: Any, weight: Any, growth: Any) -> None:
-        """Set the weights of a row, and by what share of them those of the next are more."""
+        """Set the weights of a row, and their growth: the ratio of the next row's weights to them, minus 1."""
         builder = self.builder
         exponent = apply(builder, "fma", builder.fneg(second), second, self.negative)
         is_normal = builder.fcmp_ordered(">=", exponent, constant(_LEAST))
@@ -152,7 +151,7 @@ class _Rows:
 
 @intrinsic
 def add_rows(typing_context, pixels, origin, channels, pairs, number, shapes, colors, cutoff, masks, mask_start):
-    """pixels[row, c, :] += weight[row, :] * colors[c] for the rows of a pair."""
+    """Add a pair: pixels[row, c, :] += weight[row, :] * colors[c] for its rows."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         rows = _Rows(context, builder, signature.args, arguments)
@@ -172,8 +171,10 @@ def gather_rows(
     typing_context, pixels, origin, channels, pairs, number, shapes, colors, cutoff, masks, mask_start, sums, terms,
     columns,
 ):  # fmt: skip
-    """Set a pair's terms, of so many columns, to sums over its rows: w g_c for every channel c, then, with
-    v = w sum_c g_c colors_c, of v z1, v z2, v z1 z1, v z1 z2, v z2 z2; `sums`, float32, is room for as many vectors."""  # noqa: D205, D209
+    """Set a pair's terms to sums over its pixels: of w g_c per channel c, and of v (z1, z2, z1 z1, z1 z2, z2 z2).
+
+    v is w sum_c g_c colors_c; a row of `terms` has so many `columns`; `sums`, float32, is room for as many vectors.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         rows = _Rows(context, builder, signature.args, arguments)

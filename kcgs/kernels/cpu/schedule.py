@@ -1,8 +1,9 @@
-"""The tasks of the CPU kernel: nodes that are cleared, rows of blocks, and ranges of Gaussians whose terms are summed.
+"""The tasks of the CPU kernel: nodes to clear, rows of blocks, and ranges of Gaussians whose terms are summed.
 
-What adds begins with the coarsest nodes, which the finer ones read; what gathers ends there. Rows that gather into the
-same blocks of the coarser grid do so in a fixed order: the even one, then that whose number modulo 4 is 1, then 3. A
-task waits for the rows that it needs, and for what is listed before these, so that no thread waits for a whole level.
+Tasks that add begin with the coarsest nodes, which finer rows read; tasks that gather end with the coarsest nodes. Rows
+that gather into the same blocks of the coarser grid have a fixed order: the even row, then the row whose number modulo
+4 is 1, then 3. A task waits for the rows that it needs and for all tasks listed before them, so that no thread waits
+for a whole level.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 
 from kcgs.compiled.tasks import chunks
 
-# columns of a task behind its START; of a range, the first and the last + 1 in FIRST_FIELD
+# columns of a task after its START; a range has its first at FIRST_FIELD, and its last + 1 after that
 KIND = 1  # ADDS, GATHERS, both; SUMS, CLEARS
 LEVEL_FIELD = 2
 FIRST_FIELD = 2
@@ -27,7 +28,7 @@ ADDS = 1
 GATHERS = 2
 CLEARS = 4
 
-# blocks of nodes that one task clears, and Gaussians that one sums up, at least, and tasks at most
+# least blocks of nodes per task that clears, least Gaussians per task that sums, and most tasks of either kind
 _CLEAR_SIZE = 64
 _SUM_SIZE = 128
 _MOST_RANGES = 64
@@ -38,11 +39,11 @@ def order_tasks(counts: tuple[int, ...], batch: int, kind: int, num_blocks: int,
     """Return the tasks, (T, 5) int64.
 
     Args:
-        counts: rows of blocks of an image on each level; the levels above the pixels.
+        counts: rows of blocks per image on each level, the pixels first.
         batch: number of images.
         kind: ADDS, GATHERS, or both at once.
         num_blocks: blocks of nodes, all of which are cleared.
-        num_gaussians: summed up after what gathers.
+        num_gaussians: Gaussians whose terms are summed after all rows have gathered.
     """
     cleared = _ranges(CLEARS, num_blocks if len(counts) > 1 else 0, _CLEAR_SIZE)
     rows = _Rows(batch, len(cleared))
@@ -62,11 +63,11 @@ def order_tasks(counts: tuple[int, ...], batch: int, kind: int, num_blocks: int,
 
 
 class _Rows:
-    """Tasks of rows in their order, each with what must be done before."""
+    """Tasks of rows in their order, each with the number of tasks that must be done before it."""
 
     def __init__(self, batch: int, cleared: int) -> None:
         self._batch, self._cleared = batch, cleared
-        self._ends: dict[tuple[int, int, int, int], int] = {}  # number of tasks up to that of a row
+        self._ends: dict[tuple[int, int, int, int], int] = {}  # number of tasks up to and including a row's
         self.tasks: list[list[int]] = []
 
     def add(self, kind: int, level: int, rows: range) -> None:
@@ -81,10 +82,10 @@ class _Rows:
 
 
 def _needs(kind: int, level: int, row: int) -> Iterator[tuple[int, int, int]]:
-    """Return the rows, if there are such, that must be done before one: kind, level and number."""
+    """Yield kind, level and number of the rows that must be done before a row; some of them do not exist."""
     if kind & ADDS:  # its parents
         yield from ((ADDS, level + 1, row // 2), (ADDS, level + 1, (row + 1) // 2))
-    if kind & GATHERS:  # its children, and those whose parents are its own
+    if kind & GATHERS:  # its children, and earlier rows with the same parents
         yield from ((GATHERS, level - 1, child) for child in (2 * row - 1, 2 * row, 2 * row + 1))
         if row % 2 == 1:
             yield from ((GATHERS, level, row - 1), (GATHERS, level, row + 1))

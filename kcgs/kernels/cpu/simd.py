@@ -1,7 +1,7 @@
-"""Vectors of 8 float32, half a row of a tile, in LLVM: what the code of `rows` and `spline` is written with.
+"""LLVM operations on vectors of 8 float32, half a row of a tile, for the code of `rows` and `spline`.
 
-LLVM does not vectorise these loops by itself. Of vectors as wide as a row, AVX2's sixteen registers would not hold what
-a loop needs.
+LLVM does not vectorise these loops by itself. With vectors as wide as a row, a loop would need more than the sixteen
+registers of AVX2.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def ramp(half: int) -> ir.Constant:
 
 
 def exp2(builder: Any, exponent: Any, minus_one: bool = False) -> Any:
-    """Return 2 to the power of a vector, or that minus one: a polynomial between whole exponents."""
+    """Return 2^exponent, or 2^exponent - 1, as a whole power of 2 times a polynomial of the fraction."""
     exponent = apply(builder, "maxnum", exponent, constant(-126.0))
     whole = apply(builder, "rint", exponent)
     fraction = builder.fsub(exponent, whole)
@@ -101,12 +101,12 @@ def _row(builder: Any, pointer: Any, index: Any) -> Any:
 
 
 def load(builder: Any, pointer: Any, index: Any = _ZERO) -> Any:
-    """Load vector `index` from a pointer on."""
+    """Load the vector that lies `index` vectors after a pointer."""
     return builder.load(_row(builder, pointer, index), align=4)
 
 
 def store(builder: Any, value: Any, pointer: Any, index: Any = _ZERO) -> None:
-    """Store vector `index` from a pointer on."""
+    """Store a vector `index` vectors after a pointer."""
     builder.store(value, _row(builder, pointer, index), align=4)
 
 
@@ -119,7 +119,7 @@ def prefetch(builder: Any, pointer: Any, *, writes: bool = False) -> None:
 
 
 def shuffle(builder: Any, first: Any, second: Any, places: Sequence[int]) -> Any:
-    """Return the elements at `places` of two vectors, the first's before the second's."""
+    """Return the elements at `places` in the concatenation of two vectors."""
     kind = ir.VectorType(_INT, len(places))
     return builder.shuffle_vector(first, second, ir.Constant(kind, [ir.Constant(_INT, place) for place in places]))
 
@@ -137,9 +137,10 @@ def if_else(builder: Any, condition: Any, emit: Callable[[bool], None]) -> None:
 def exchange_rows(
     typing_context, image, place, row_stride, channel_stride, pixels, channels, rows, columns, adds, gathers
 ):
-    """Copy a block to an image, from element `place` on, if it `adds`; from there if it `gathers`; if both, subtract.
+    """Copy a block to an image if it `adds`, from the image if it `gathers`; if both, subtract the image from it.
 
-    The block has rows of SIDE elements, [row][channel][column]; `rows` and `columns` are those within the image.
+    The block begins at element `place` of the image and has rows of SIDE elements, [row][channel][column]; its first
+    `rows` and `columns` lie within the image.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -150,7 +151,7 @@ def exchange_rows(
         )
 
         def exchange(inside: Any, outside: Any, subtracts: bool | None) -> None:
-            """Exchange what two pointers hold; `subtracts`: None to copy outward."""
+            """Copy outward if `subtracts` is None, inward if False; if True, subtract the outside from the inside."""
             if subtracts is None:
                 builder.store(builder.load(inside, align=4), outside, align=4)
             elif subtracts:
@@ -164,7 +165,7 @@ def exchange_rows(
                 inside = builder.gep(pixels, [builder.mul(first, long(SIDE))])
                 offset = builder.add(builder.mul(row.index, row_stride), builder.mul(channel.index, channel_stride))
                 outside = builder.gep(image, [offset])
-                # the end of the row of the next block, whose lines are too far apart for the processor to foresee
+                # the end of this row in the next block; the processor does not foresee lines so far apart
                 prefetch(builder, builder.gep(outside, [long(2 * SIDE - 1)]), writes=subtracts is None)
 
                 def emit_row(is_whole: bool) -> None:
@@ -186,7 +187,7 @@ def exchange_rows(
 
 
 def sum_columns(builder: Any, rows: Sequence[Any]) -> Any:
-    """Return the sums of eight vectors, as a vector, in a fixed order."""
+    """Return the sum of each of eight vectors, as a vector; the order of addition is fixed."""
     rows = [rows[k] for k in (0, 4, 2, 6, 1, 5, 3, 7)]
     # the halves of two rows are interleaved and added, until one row is left
     width = HALF
@@ -197,7 +198,7 @@ def sum_columns(builder: Any, rows: Sequence[Any]) -> Any:
 
 
 def _fold(builder: Any, first: Any, second: Any, width: int) -> Any:
-    """Add the halves of every group of `width` elements of two vectors, the first's and the second's in turn."""
+    """Add the halves of every group of `width` elements; the groups of the two vectors alternate in the result."""
     half = width // 2
     places = [
         [HALF * side + group + shift + k for group in range(0, HALF, width) for side in (0, 1) for k in range(half)]

@@ -1,7 +1,7 @@
 """Vector code from a coarse grid to one of half its spacing, and back, in blocks of 16 x 16.
 
-Along an axis, values 2 i and 2 i + 1 of the finer grid are each a sum of four neighbours, i ... i + 3, of a window of
-the coarser one, which begins at a block's first node or in its middle. Blocks lie in memory as [row][channel][column].
+Along an axis, values 2 i and 2 i + 1 of the finer grid are weighted sums of nodes i ... i + 3 of a window of the
+coarser grid. A window begins at a block's first node or in its middle. Blocks lie in memory as [row][channel][column].
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def _vector(factors: Sequence[float]) -> ir.Constant:
 
 
 class _Blocks:
-    """A block of the finer grid and the four of the coarser one that it reads, as LLVM values."""
+    """A block of the finer grid and the four blocks of the coarser grid that it reads, as LLVM values."""
 
     def __init__(self, context: Any, builder: Any, argument_types: Any, arguments: Any) -> None:
         self.builder = builder
@@ -79,7 +79,7 @@ class _Blocks:
         return load(self.builder, self.builder.gep(self.masks, [self.builder.add(place, long(half * HALF))]))
 
     def window_row(self, channel: Any, row: int, right: bool) -> Callable[[int], Any]:
-        """Return a function from a node of a row of the window to the pointer to it."""
+        """Return a function that takes a node of a row of the window and returns its pointer."""
         builder = self.builder
         place = builder.add(long(row), builder.select(self.down, long(HALF), long(0)))
         below = builder.icmp_signed(">=", place, long(SIDE))
@@ -94,7 +94,7 @@ class _Blocks:
         return find_node
 
     def each(self, emit: Callable[[Any, bool], None]) -> None:
-        """Emit a loop over channels, for windows that begin in the middle of the left block and for others."""
+        """Emit two loops over channels: one if the window begins in the middle of the left block, one if not."""
 
         def loop_over(right: bool) -> None:
             with cgutils.for_range(self.builder, self.channels) as loop:
@@ -104,11 +104,11 @@ class _Blocks:
 
 
 def _make_loop(emit: Callable[[_Blocks, Any, bool], None]) -> Any:
-    """Make an intrinsic over the channels of a block; emit(blocks, channel, right) is the code of one.
+    """Make an intrinsic over the channels of a block; emit(blocks, channel, right) emits the code of one channel.
 
-    Its arguments: `coarse`, float32, has the parents at four `offsets`; the window begins in the middle of the upper
-    ones if `down`, of the left ones if `right`. `fine`, float32, has the block from element `origin` on, `masks`,
-    float32, the weights of its rows from element `mask_start` on; strides count elements.
+    Arguments of the intrinsic: `coarse`, float32, has the parents at four `offsets`; the window begins in the middle of
+    the upper parents if `down`, of the left parents if `right`. `fine`, float32, has the block from element `origin`
+    on; `masks`, float32, has the weights of its rows from element `mask_start` on; strides count elements.
     """
 
     @intrinsic

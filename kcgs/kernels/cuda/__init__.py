@@ -1,7 +1,7 @@
 """The kernel `cuda`: six Triton programs, float32, which plan, render and differentiate on the device.
 
-`plan` finds the Gaussians of every tile, `render` sums them at its pixels, `gather` differentiates. A list's place in
-memory is reserved by an atomic addition; no sum is: each has one owner and one order, so the same bits come every time.
+`plan` finds the Gaussians of every tile, `render` sums them at its pixels, `gather` differentiates. Atomic additions
+reserve the memory of lists, but compute no sum: each sum has one owner and one order, so results repeat bit for bit.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def _has_triton() -> bool:
 
 
 def kernel_for(inputs: SplatInputs) -> Kernel:
-    """Return the kernel, if it takes these inputs."""
+    """Return the kernel; raise where it does not take the inputs, or Triton is missing."""
     dtype, device = inputs.means.dtype, inputs.means.device
     if dtype != torch.float32:
         raise ValueError(f"backend 'cuda' computes in float32; got {dtype}: use 'tiled' or 'reference'")

@@ -1,9 +1,9 @@
 """Room for the lists of a plan where the host does not wait for the device: in a CUDA graph, and in steps of a fit.
 
 An eager plan reads its number of slots from the device. Elsewhere the lists have room for 1.5 times the largest number
-that was seen for the size, and 65,536 slots more, since the number grows fastest where Gaussians are few and wide. A
-plan that does not fit, or whose values are not finite, renders NaN and adds to counters on the device. The next eager
-plan reads and reports the counters of CUDA graphs; `settle` reads those of a fit.
+of slots seen for the image size, plus 65,536, since the number grows fastest where Gaussians are few and wide. A plan
+that does not fit, or whose values are not finite, renders NaN and adds to counters on the device. The next eager plan
+reads and reports the counters of CUDA graphs; `settle` reads the counters of a fit.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from kcgs._warn import warn_user
 from ..interface import SplatInputs
 
 _ROOM, _LEAST_ROOM = 1.5, 1 << 16
-# they count in 32 bits
+# the programs count slots in 32 bits
 _MOST_SLOTS = (1 << 31) - 1
 
 # slots of the largest plan of a device, a number of images and a size
 _most: dict[tuple[torch.device, int, tuple[int, int]], int] = {}
-# counters of each device, int64: plans whose lists did not fit, plans whose values were not finite, and the most slots
-# of one; with False those of plans within `without_waiting`
+# int64 counters, by device and whether plans wait (False: within `without_waiting`): plans whose lists did not fit,
+# plans whose values were not finite, and the most slots of a plan
 _notes: dict[tuple[torch.device, bool], Tensor] = {}
 _waits: ContextVar[bool] = ContextVar("whether plans wait for the device", default=True)
 
 
 @contextmanager
 def without_waiting() -> Iterator[None]:
-    """Plan as in a CUDA graph, except for a size that has not been seen."""
+    """Plan without waiting for the device, as in a CUDA graph; the first plan of a size still waits."""
     token = _waits.set(False)
     try:
         yield
@@ -42,7 +42,7 @@ def without_waiting() -> Iterator[None]:
 
 
 def reserve(inputs: SplatInputs) -> int | None:
-    """Return the slots to make room for; None: wait for their number."""
+    """Return the number of slots to make room for; None: the plan waits for their number."""
     captured = inputs.means.is_cuda and torch.cuda.is_current_stream_capturing()
     if _waits.get() and not captured:
         return None
@@ -64,7 +64,7 @@ def remember(inputs: SplatInputs, slots: int) -> None:
 
 @contextmanager
 def room_for(inputs: SplatInputs, slots: int) -> Iterator[None]:
-    """Allocate what so many slots need; a ValueError says why there are so many."""
+    """Turn a lack of memory for so many slots into a ValueError that says why there are so many."""
     if slots > _MOST_SLOTS:
         raise _too_many(inputs, slots)
     try:
@@ -82,7 +82,7 @@ def _too_many(inputs: SplatInputs, slots: int) -> ValueError:
 
 
 def reports() -> bool:
-    """Whether the host waits for a plan, which then reads the counters; within `without_waiting`, `settle` does."""
+    """Return whether an eager plan reads and reports the counters; within `without_waiting`, `settle` reads them."""
     return _waits.get()
 
 
@@ -98,7 +98,7 @@ def report(full: int, not_finite: int, most: int) -> None:
 
 
 def settle(device: torch.device, num_images: int, size: tuple[int, int]) -> bool:
-    """Make room for what did not fit within `without_waiting` since the last time; return whether anything failed."""
+    """Make room for plans of `without_waiting` that did not fit since the last call; return whether any failed."""
     notes = _notes.get((device, False))
     if notes is None:
         return False
@@ -110,7 +110,7 @@ def settle(device: torch.device, num_images: int, size: tuple[int, int]) -> bool
 
 
 def notes_of(device: torch.device) -> Tensor:
-    """Return the counters of a device for plans here."""
+    """Return the counters of a device, for plans that wait or for plans that do not."""
     key = device, _waits.get()
     if key not in _notes:
         with torch.inference_mode(False):

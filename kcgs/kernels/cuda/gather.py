@@ -1,7 +1,7 @@
 """Gradients: sums over the pixels of each pair, then over the pairs of each Gaussian.
 
-A thread owns a pair and 4 rows of its tile, and walks their pixels; the threads of a pair then add up what they have. A
-program of `_reduce` owns a Gaussian, and adds its slots in order.
+A thread owns a pair and 4 rows of its tile, and walks their pixels; the threads of a pair then add up their sums. A
+program of `_reduce` owns a Gaussian, and adds the terms of its slots in order.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The Gaussians of every tile of 16 x 16 pixels, found in three launches.
 
 `_prepare` makes a box of tiles for each Gaussian, and reserves a slot for each tile of it. `_bin` lists the Gaussians
-of each cell of 8 x 8 tiles. `_tile` lists those of each tile, as pairs, and writes into every slot the place of its
-pair. Every list is in the order of the Gaussians.
+of each cell of 8 x 8 tiles. `_tile` lists the Gaussians of each tile, as pairs, and writes into every slot the place of
+its pair. Every list is in the order of the Gaussians.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from ..whitened import SCALE as EXPONENT_SCALE
 from .capacity import notes_of, remember, report, reports, reserve, room_for
 from .triton_function import triton_function
 
-# Gaussians of a program of `_prepare`, and of a step of the others
+# Gaussians per program of `_prepare`, and per step of a loop of `_bin` and `_tile`
 _PREPARE_BLOCK, _BIN_BLOCK, _TILE_BLOCK = 128, 1024, 128
 
 # tiles along a side of an image: their numbers have 16 bits, of which one is the sign
 _MOST_TILES = (1 << 15) - 1
 
-# what programs read as constants
+# constants of the programs
 SIDE = tl.constexpr(TILE)
 PIECE = tl.constexpr(8)  # pairs of a program of the backward
 SCALE = tl.constexpr(EXPONENT_SCALE)
@@ -45,7 +45,7 @@ _MOST_SCALE = tl.constexpr(SCALE_LIMITS[1])
 SLOTS = tl.constexpr(0)  # tiles of all boxes
 INVALID = tl.constexpr(1)  # Gaussians whose values are not finite or out of range, or whose region id is negative
 _FOREIGN = tl.constexpr(2)  # Gaussians whose region id the map does not hold
-_ENTRIES = tl.constexpr(3)  # of the cells' lists
+_ENTRIES = tl.constexpr(3)  # entries of the cells' lists
 _PAIRS = tl.constexpr(4)  # places of the tiles' lists
 PIECES = tl.constexpr(5)
 _NOTES = tl.constexpr(6)  # the counters of earlier plans, see capacity.py
@@ -53,11 +53,11 @@ _COUNTERS = 9
 
 
 class CudaPlan(NamedTuple):
-    """The lists of a batch of images, whose Gaussians are numbered through."""
+    """The lists of a batch of images; Gaussians are numbered across the batch."""
 
     counters: Tensor  # [9] int64
     gaussians: Tensor  # [4, B * N] int32: first and last tile of the box, each row * 2^16 + column; first slot; region
-    lists: Tensor  # [2, cells + tiles] int32: place of the first entry or pair, and how many
+    lists: Tensor  # [2, cells + tiles] int32: place of the first entry or pair, and their number
     slots: Tensor  # [4, S] int32: entries of cells; Gaussians of pairs, and their planes; pairs of slots, -1: none
     coefficients: Tensor  # [S, 5] float32, of pairs: see tiles.coefficients, times SCALE
     pieces: Tensor  # [2, P] int32: a tile, and the first of up to 8 of its pairs
@@ -185,7 +185,7 @@ def _tile_of(pixel, touches, length):
 
 @triton.jit
 def fails(counters, room):
-    """Whether lists do not fit, or values are not valid: nothing is listed then, and the image is NaN."""
+    """Return whether lists do not fit, or values are not valid: nothing is listed then, and the image is NaN."""
     return (tl.load(counters + SLOTS) > room) | (tl.load(counters + INVALID) > 0)
 
 
@@ -258,7 +258,7 @@ def _tile(
         g = tl.load(slots + entry, mask=entry < end, other=0)
         x0, y0, x1, y1 = _box(gaussians, g, total, entry < end)
         hits += ((x0 <= column) & (x1 >= column) & (y0 <= row) & (y1 >= row)).to(tl.int32)
-    # room for all boxes that hold the tile: those that do not reach it leave a gap
+    # reserve a place for every box that holds the tile: Gaussians that do not reach the tile leave a gap at the end
     first = tl.atomic_add(counters + _PAIRS, tl.sum(hits, axis=0).to(tl.int64)).to(tl.int32)
     place = first
     if MAPPED:
@@ -281,7 +281,7 @@ def _tile(
         l11 = tl.load(cholesky + 3 * g, mask=keeps, other=1.0).to(tl.float64)
         l21 = tl.load(cholesky + 3 * g + 1, mask=keeps, other=0.0).to(tl.float64)
         l22 = tl.load(cholesky + 3 * g + 2, mask=keeps, other=1.0).to(tl.float64)
-        # from the mean to the tile's centre; z1 is bounded by the box, and here the least z2 over the tile
+        # offset of the tile's centre from the mean; the box bounds z1, and `nearest` is the least |z2| times l22
         x = column * SIDE + SIDE / 2 - x
         y = row * SIDE + SIDE / 2 - y
         inverse1, inverse2 = 1 / l11, 1 / l22

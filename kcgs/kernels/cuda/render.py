@@ -40,13 +40,13 @@ def render(plan: CudaPlan, inputs: SplatInputs, target: Tensor | None = None) ->
 
 
 def lists_of(plan: CudaPlan, inputs: SplatInputs) -> tuple[Any, ...]:
-    """Return what the programs of image and gradients read of a plan and a map."""
+    """Return the arguments that `_render` and `_gather` share."""
     grid, arrays = plan.grid, (plan.counters, plan.lists, plan.slots, plan.coefficients, plan.weights)
     return *arrays, plan.room, plan.num_cells, grid.total, grid.rows, grid.cols, max(inputs.cutoff, _LEAST_WEIGHT)
 
 
 def channels_at_once(channels: int) -> int:
-    """Return the channels of a program."""
+    """Return the number of channels that a program evaluates at once."""
     return min(_MAX_CHANNELS, channels)
 
 
@@ -79,7 +79,7 @@ def _render(
     for pair in tl.range(first, first + count, loop_unroll_factor=_UNROLL):
         _, _, weight = weigh(tl.load(k), tl.load(k + 1), tl.load(k + 2), tl.load(k + 3), tl.load(k + 4), x, y, cutoff)
         if MAPPED:
-            # below 0 where the region is alone
+            # negative where the region is alone in its tile
             place = tl.load(slots + 2 * room + pair).to(tl.int64) * (SIDE * SIDE) + pixel
             weight *= tl.load(weights + place, mask=place >= 0, other=1.0)
         color = colors + tl.load(slots + room + pair).to(tl.int64) * channels + base
