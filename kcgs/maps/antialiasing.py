@@ -1,6 +1,6 @@
 """Antialiased labels: a smooth curve through a contour cuts the pixels beside it.
 
-Standard operators only, and no shape depends on values, so that a graph can hold it.
+It uses standard operators only, and no shape depends on values, so that an ONNX graph can hold it.
 """
 
 from __future__ import annotations
@@ -14,13 +14,14 @@ from torch.nn.functional import max_pool2d, pad
 
 # pixels along a straight piece of contour within which its ends are looked for
 _SEARCH = 32
-# sixteenths that the weight of a line one pixel wide and that of its surroundings add up to
+# the weight of a pixel on a line one pixel wide is multiplied by _LINE_SUM / own - 1, where `own` is the share of its
+# label around it, in sixteenths
 _LINE_SUM = 21.6
-_LINE = 8  # sixteenths of a pixel's surroundings: a line one pixel wide has no more of its own label
+_LINE = 8  # largest `own` of a pixel that counts as part of a line one pixel wide
 
 
 class SmoothLabels(NamedTuple):
-    """What each pixel is of, (B, H, W): its own label, and that of one neighbour."""
+    """The weights of two labels in each pixel, (B, H, W): of its own, and of one neighbour's."""
 
     weight: Tensor  # float64, of its own label
     other: Tensor  # label of the neighbour
@@ -31,16 +32,17 @@ def antialias(labels: Tensor, is_sharp: Tensor) -> SmoothLabels:
     """Antialias labels, (B, H, W); lines one pixel wide get a larger weight where their contours are sharp.
 
     The sides of pixels in a row that have one label above them and one below form a piece of contour. Where the contour
-    goes on one pixel higher or lower, and along the row again, it runs through the middle of that step. The curve is
-    the parabola through these middles, or else the ends of the piece, and the middle of the piece. A straight contour
-    of any slope becomes straight. Of two neighbours that take a part of a pixel, the one that takes more counts.
+    goes on one pixel higher or lower, and along the row again, the curve runs through the middle of that step. The
+    curve is the parabola through three points: the middles of the steps at both ends of the piece, or an end itself
+    where there is no step, and the middle of the piece. A straight contour of any slope becomes straight. If two
+    neighbours take a part of a pixel, the neighbour that takes more counts.
     """
     share, own = torch.zeros_like(labels, dtype=torch.float64), torch.zeros_like(labels)
     other = labels
     for is_column in (False, True):
         image = labels.mT if is_column else labels
         height = _curve(image)
-        # what the row above takes of a pixel, and what the row below does, across its own upper side
+        # the parts of a pixel that the rows above and below take; the row below takes it across its own upper side
         for taken, step in ((-height, -1), (shifted(height, 1, 0) * (shifted(image, 1, 0) != image), 1)):
             parts = taken, shifted(image, step, 0)
             part, neighbour = (p.mT for p in parts) if is_column else parts
@@ -61,7 +63,7 @@ def _curve(image: Tensor) -> Tensor:
 
 
 def _ends(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Return how far each pixel is from the left end of the piece above it, which steps up, 1, or down, -1, or not."""
+    """Return each pixel's distance to the left end of the piece above it, and the step there: 1 up, -1 down, or 0."""
     (above2, left_above2), (above, left_above), (own, left), (below, left_below) = (
         (shifted(image, y, 0), shifted(image, y, -1)) for y in (-2, -1, 0, 1)
     )
@@ -76,7 +78,7 @@ def _ends(image: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def shifted(image: Tensor, down: int, right: int) -> Tensor:
-    """Return what is so many pixels below and to the right of each pixel, (B, H, W); the border repeats."""
+    """Return the value so many pixels below and to the right of each pixel, (B, H, W); the border repeats."""
     for dim, step in ((-2, down), (-1, right)):
         if step:
             length = image.shape[dim]

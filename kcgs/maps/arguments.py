@@ -1,4 +1,4 @@
-"""Maps as functions take them: a RegionMap, or what it is made from."""
+"""Maps as arguments of functions: a RegionMap, or labels that a map is made from."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from .table import MapTable
 
 
 def as_region_map(value: object, name: str = "regions") -> RegionMap | None:
-    """Return a RegionMap or None as they are, and the map with hard contours of labels; `name` is for errors."""
+    """Return a RegionMap or None unchanged, and labels as a map with hard contours; `name` is for errors."""
     if value is None or isinstance(value, RegionMap):
         return value
     if is_label_source(value):
         labels = check_labels(name, value)
-        with torch.inference_mode(False):  # a graph of autograd keeps no tensor of that mode
+        with torch.inference_mode(False):  # autograd saves no tensor of inference mode
             return wrap_labels(labels.clone(), 0.0)
     raise TypeError(f"{name} must be a RegionMap, a label map or None; got {type(value).__name__}")
 
 
 def table_and_size(regions: object) -> tuple[MapTable, tuple[int, int]]:
-    """Return the table of a map, of labels those alone, and the size at which it is sampled; refuse anything else."""
+    """Return the table of a map, or a table of labels alone, and the size at which it is sampled."""
     if isinstance(regions, RegionMap):
         return regions._table, regions.size
     if isinstance(regions, (Tensor, np.ndarray)):  # graphs of torch 2.7 know no other form

@@ -1,7 +1,7 @@
-"""What is made of a map's table when it is first needed: the map at other sizes, and a kernel's arrays.
+"""Results that are derived from a map's table on first use: the map at other sizes, and a kernel's arrays.
 
-The rule: a result lives as long as the tensor `starts` of the table that it was made of, so it must not hold that
-tensor. What is made of labels alone, which have no `starts` yet, is not kept.
+A result lives as long as the tensor `starts` of its table, so it must not refer to that tensor. Results of labels
+alone, whose table has no `starts`, are not kept.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from .tiles import complete
 
 T = TypeVar("T")
 
-_KEPT_SIZES = 3  # of a map: a viewer renders at ever new sizes
+_KEPT_SIZES = 3  # per map: a viewer renders at ever new sizes
 
-# by the `starts` of a table: what functions have made of it, by the function
+# results by the `starts` of a table, then by the function
 _derived: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
 
 
 def derive(table: MapTable, make: Callable[[MapTable], T]) -> T:
-    """Return what a function makes of a table, which it is called for once."""
+    """Return make(table); the function is called once per table that has `starts`."""
     if table.starts is None:
         return make(table)
     results: dict[Any, Any] | None = _derived.get(table.starts)
@@ -38,7 +38,7 @@ def derive(table: MapTable, make: Callable[[MapTable], T]) -> T:
 
 
 class _Sizes:
-    """The memberships of a map at other sizes than its own, those added last."""
+    """The memberships of a map at the few sizes other than its own that were added last."""
 
     def __init__(self, table: MapTable) -> None:
         self._smooth = SmoothMembership(Membership(table.without_tiles()))

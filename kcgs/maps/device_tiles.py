@@ -1,9 +1,9 @@
 """The tiles of a `MapTable` by torch operations, on any device; `tiles.py` has the CPU's own form.
 
-On one core of a CPU they take 64 maps of 128 x 128 pixels 148 ms with hard contours and 166 with soft ones, where the
-compiled loops take 7 and 51: so both forms stay. A tile has the regions of all pixels that its own are blurred with.
-Windows, the pixels around tiles, are compared with regions on the map's device, which the host waits for twice: each
-list has a length that depends on the map.
+For 64 maps of 128 x 128 pixels on one CPU core they need 148 ms with hard contours and 166 ms with soft contours; the
+compiled loops need 7 and 51 ms: so both forms stay. A tile lists the regions of all pixels that its own pixels are
+blurred with. A window is a tile and the pixels around it. The host waits twice for the device: the lengths of two lists
+depend on the map.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch import Tensor
 from .tile import TILE
 from .widths import reach_of, truncated_gaussian
 
-# bytes of windows and what is made of them at once
+# bytes of windows and their intermediate results that are in memory at once
 _CHUNK_BYTES = 1 << 27
 # bytes per pixel of a window in a list: the label, its tests, its key
 _LISTED_BYTES = 24
@@ -33,7 +33,7 @@ def tiles_on_device(
         index: position of each pixel's region among the sorted ids, (maps, H, W) int32.
         num_regions: number of ids.
         widths: of contours in pixels, ascending; 0 is hard.
-        width_index: position of each pixel's width among them, (maps, H, W) int32; None where there is one.
+        width_index: position of each pixel's width among them, (maps, H, W) int32; None where there is one width.
     """
     windows = _Windows(index, reach_of(widths[-1]))
     tile_widths = None if width_index is None else _TileWidths(width_index)
@@ -81,7 +81,7 @@ class _Windows:
         return self._labels[self.places(tiles)]
 
     def places(self, tiles: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return map, row and column of tiles among the tiles."""
+        """Return map, row and column of each tile in the grid of tiles."""
         _, rows, cols = self.grid
         return tiles // (rows * cols), tiles // cols % rows, tiles % cols
 
@@ -98,7 +98,7 @@ class _Windows:
 
     @property
     def offsets(self) -> Tensor:
-        """Places of a window's pixels along an axis, from the tile's first, (side,)."""
+        """Places of a window's pixels along an axis, from the tile's first pixel, (side,)."""
         return torch.arange(self.side, device=self._labels.device) - self.reach
 
 
@@ -115,12 +115,12 @@ class _TileWidths:
         self._widest = ascending[:, -1]
 
     def reaches(self, widths: Sequence[float]) -> Tensor:
-        """Return how far the pixels of each tile see, (tiles,)."""
+        """Return the reach of the widest blur of each tile, in pixels, (tiles,)."""
         return _on_device([reach_of(width) for width in widths], self.counts.device)[self._widest]
 
 
 class _Members(NamedTuple):
-    """Regions of tiles, and the labels that say which pixels are theirs."""
+    """Pairs of a tile and a region, and the windows with the labels."""
 
     windows: _Windows
     tiles: Tensor  # [P]
@@ -135,7 +135,7 @@ class _Members(NamedTuple):
         return weights
 
     def blur_by_pixel(self, widths: Sequence[float], tile_widths: _TileWidths, count: int) -> Tensor:
-        """Return the same, each pixel blurred by its own width: `count` is the sum of the tiles' numbers of widths."""
+        """Blur each pixel by its own width; `count` is the number of widths per tile, summed over the tiles."""
         weights = torch.zeros(len(self.tiles), TILE * TILE, dtype=torch.float32, device=self.tiles.device)
         blurs = _Blurs(self.windows, widths)
         counts = tile_widths.counts[self.tiles]
@@ -158,12 +158,12 @@ class _Blurs:
         device = windows.offsets.device
         distance = (windows.offsets - torch.arange(TILE, device=device)[:, None]).abs()
         self._taps = truncated_gaussian(distance, _on_device(widths, device)[:, None, None])  # [widths, 16, side]
-        # what of the taps lies within the image, [widths, tiles of the axis, 16]
+        # sums of the taps that lie within the image, [widths, tiles of the axis, 16]
         self._totals = [(self._taps @ windows.inside(axis).double().mT).mT for axis in (0, 1)]
         self.bytes = 8 * windows.side * (2 * windows.side + 3 * TILE)  # of one window
 
     def apply(self, tiles: Tensor, regions: Tensor, widths: Tensor) -> Tensor:
-        """Blur what is of regions in the windows of tiles, (n, 256)."""
+        """Blur the masks of regions in the windows of tiles, (n, 256)."""
         members = (self._windows.labels(tiles) == regions[:, None, None]).double()
         _, rows, cols = self._windows.places(tiles)
         down, across = (part[widths, place] for part, place in zip(self._totals, (rows, cols), strict=True))
@@ -173,14 +173,14 @@ class _Blurs:
 
 
 def _on_device(values: Sequence[float], device: torch.device) -> Tensor:
-    """Return float64 numbers on a device, which the host does not wait for."""
+    """Copy float64 numbers to a device; the host does not wait."""
     return torch.tensor(values, dtype=torch.float64).to(device, non_blocking=True)
 
 
 def _list_keys(windows: _Windows, num_regions: int, reaches: Tensor | None) -> Tensor:
-    """List tile * num_regions + region, some more than once, of the regions in each tile's window.
+    """List the keys tile * num_regions + region of the regions in each tile's window; keys may repeat.
 
-    A region's first pixel in a window, row by row, differs from the pixels above it and left of it.
+    It takes the pixels that differ from the pixel above and the pixel to the left, as every region's first pixel does.
     """
     keys = []
     tiles, offsets = torch.arange(math.prod(windows.grid), device=windows.offsets.device), windows.offsets

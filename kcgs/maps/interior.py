@@ -29,7 +29,7 @@ def interior_points(labels: Tensor) -> tuple[Tensor, Tensor]:
     padded, cross = np.pad(index, 1, constant_values=-1), ndimage.generate_binary_structure(2, 1)
     inner = ndimage.minimum_filter(padded, footprint=cross) == ndimage.maximum_filter(padded, footprint=cross)
     inner[[0, -1]] = inner[:, [0, -1]] = False
-    # the nearest border pixel is of the same region, and one pixel from the outside
+    # the transform measures to the nearest border pixel of the region, which is one pixel from the outside
     distances = ndimage.distance_transform_edt(inner)[1:-1, 1:-1] + 1
     places = np.array(ndimage.maximum_position(distances, index, np.arange(index.max() + 1)))
     return torch.from_numpy(places[:, ::-1].copy()), torch.from_numpy(distances[places[:, 0], places[:, 1]])

@@ -17,7 +17,7 @@ program = Program("tables of label maps")
 
 @program.entry
 def number_regions(labels, limit, index):
-    """Fill the position of each pixel's label among the ids, which are returned; none unless all are in [0, limit).
+    """Fill each label's position among the sorted ids, and return the ids; none if a label is outside [0, limit).
 
     Labels, (N,), and index, (N,), are flat.
     """
@@ -46,7 +46,7 @@ def number_regions(labels, limit, index):
 def find_positions(region_ids, ids, limit, positions):
     """Fill the position of each id among sorted `ids`, -1 where it is not one of them; all are flat.
 
-    Ids below a limit are looked up in a table.
+    If all `ids` are below the limit, a table replaces the search.
     """
     largest = ids[-1]
     if largest < limit:
@@ -65,13 +65,13 @@ def find_positions(region_ids, ids, limit, positions):
 def list_regions(index, width_index, reaches, num_regions):
     """Return the number of regions of each tile, (T,), and the regions, ascending, one tile after the other.
 
-    A region belongs to a tile if it has a pixel within the reach of the tile's widest contour; `reaches` are those of
-    the widths, and `width_index` is empty where there is one.
+    A region belongs to a tile if it has a pixel within the reach of the tile's widest contour. `reaches` has the reach
+    of each width; `width_index` is empty where there is one width.
     """
     maps, height, width = index.shape
     rows, cols = (height + SIDE - 1) // SIDE, (width + SIDE - 1) // SIDE
     counts, regions = np.empty(maps * rows * cols, np.int64), np.empty(maps * rows * cols + 1, np.int32)
-    tiles = np.full(num_regions, -1)  # the last that holds a region
+    tiles = np.full(num_regions, -1)  # last tile that was found to hold each region
     end = 0
     for t in range(len(counts)):
         image, top, left = t // (rows * cols), t // cols % rows * SIDE, t % cols * SIDE
@@ -95,13 +95,13 @@ def list_regions(index, width_index, reaches, num_regions):
 
 @program.entry
 def list_window_regions(starts, regions, shape, places, span, num_regions):
-    """Return the same for windows of `span` pixels at places, (T, 3): the regions of the tiles that they touch.
+    """Return number and regions of windows, as `list_regions` does of tiles: the regions of the tiles they touch.
 
     Args:
         starts: of a `MapTable`.
-        regions: of it.
+        regions: of the same table.
         shape: maps, height and width.
-        places: map, first row and first column; rows and columns may lie beyond the image.
+        places: (T, 3), map, first row and first column; rows and columns may lie beyond the image.
         span: height and width of a window.
         num_regions: of the map.
     """
@@ -141,7 +141,7 @@ def _insert(values, first, end, value):
 def cut_windows(starts, regions, planes, weights, shape, places, members, windows, tasks, counters):
     """Fill the membership of regions, (P,), over windows, (P, h, w), at places, (P, 3), out of a `MapTable`.
 
-    `shape` is as of `list_window_regions`; membership is 0 beyond the tiles. Tasks are ranges of windows.
+    `shape` is that of `list_window_regions`; membership is 0 beyond the tiles. Tasks are ranges of windows.
     """
     rows, cols = (shape[1] + SIDE - 1) // SIDE, (shape[2] + SIDE - 1) // SIDE
     height, width = windows.shape[1:]
@@ -161,7 +161,7 @@ def cut_windows(starts, regions, planes, weights, shape, places, members, window
 
 @inner
 def _copy_plane(plane, weights, top, left, window):
-    """Copy what of a tile lies in a window."""
+    """Copy the part of a tile that lies in a window."""
     height, width = window.shape
     for y in range(max(top, 0), min(top + SIDE, height)):
         for x in range(max(left, 0), min(left + SIDE, width)):
@@ -170,11 +170,11 @@ def _copy_plane(plane, weights, top, left, window):
 
 @program.entry
 def fill_planes(index, smooth, width_index, taps, starts, regions, planes, weights, tasks, counters):
-    """Fill the membership of regions in the tiles of a `MapTable` that several share.
+    """Fill the membership of regions in the tiles of a `MapTable` that hold several regions.
 
-    Labels are those of `index`, or, where the arrays of `smooth`, a tuple as of `SmoothLabels`, are not empty, those.
-    Row k of taps is half of the blur for pixels of width k, its centre first, then zeros; `width_index` is empty where
-    one width is for all. Tasks are ranges of tiles.
+    `smooth` has the arrays of `SmoothLabels`; if they are not empty, they divide each pixel between its own label in
+    `index` and a neighbour's. Row k of taps is half of the blur for pixels of width k, its centre first, then zeros;
+    `width_index` is empty where there is one width. Tasks are ranges of tiles.
     """
     _, height, width = index.shape
     rows, cols = (height + SIDE - 1) // SIDE, (width + SIDE - 1) // SIDE
@@ -225,7 +225,7 @@ def fill_planes(index, smooth, width_index, taps, starts, regions, planes, weigh
 
 @inner
 def _read(image, top, left, side, outside, square):
-    """Read a square of an image, with a value beyond it."""
+    """Read a square of an image; beyond the image it has the value `outside`."""
     first, end = max(-left, 0), min(side, image.shape[1] - left)
     for y in range(side):
         square[y] = outside
@@ -242,7 +242,7 @@ def _mark_members(labels, region, weights):
 
 @inner
 def _find_members(labels, region, member):
-    """Mark the pixels of a line that are of a region; return their number."""
+    """Mark the pixels of a line that belong to a region; return their number."""
     count = 0
     for x in range(len(member)):
         member[x] = labels[x] == region
@@ -252,7 +252,7 @@ def _find_members(labels, region, member):
 
 @inner
 def _share(labels, own_shares, others, other_shares, region, member):
-    """Fill how much of each pixel of a line is of a region."""
+    """Fill the share of each pixel of a line that belongs to a region."""
     for x in range(len(member)):
         other = other_shares[x] if others[x] == region else 0.0
         member[x] = own_shares[x] if labels[x] == region else other
@@ -272,7 +272,7 @@ def _blur(half, line, blurred):
 
 @inner
 def _blur_rows(half, rows, is_empty, blurred):
-    """Blur the rows of a tile's window to those of the tile."""
+    """Blur the rows of a tile's window to the rows of the tile."""
     n = len(half) - 1
     for y in range(SIDE):
         total = blurred[y]
@@ -294,7 +294,7 @@ def _divide(total, down, across):
 
 @inner
 def _copy_pixels(total, width_index, k, place, weights):
-    """Copy the pixels of a width; where there is one, all."""
+    """Copy the pixels of width k; all pixels where there is one width."""
     image, top, left = place
     for y in range(SIDE):
         for x in range(SIDE):
@@ -304,7 +304,7 @@ def _copy_pixels(total, width_index, k, place, weights):
 
 @inner
 def _sum_inside(half, first, length):
-    """Sum the taps that lie inside of an axis, around each pixel of a tile."""
+    """Return for each pixel of a tile the sum of the taps around it that lie within the image along an axis."""
     line = np.zeros(SIDE + 2 * len(half) - 2)
     begin = len(half) - 1 - first
     line[max(begin, 0) : max(begin + length, 0)] = 1.0

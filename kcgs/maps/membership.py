@@ -1,4 +1,4 @@
-"""Membership s_r(x, y) of pixels in regions by its definition: what tiles and kernels are compared with.
+"""Membership s_r(x, y) of pixels in regions by its definition: tests compare tiles and kernels with it.
 
 `RegionMap` documents the blur.
 """
@@ -18,7 +18,7 @@ from .widths import reach_of, truncated_gaussian
 class Membership:
     """The membership of a map at its own size; the table has ids and positions."""
 
-    margin = 0  # pixels that what is blurred reaches farther than the labels
+    margin = 0  # pixels by which the weights before the blur reach beyond a region's labels
 
     def __init__(self, table: MapTable) -> None:
         assert table.positions is not None
@@ -46,7 +46,7 @@ class Membership:
         return weights.to(dtype)
 
     def _inside(self, batch: int, region: int) -> Tensor:
-        """Return what is blurred, (H, W) float64."""
+        """Return the weights of a region before the blur, (H, W) float64."""
         return (self.index[batch] == region).to(torch.float64)
 
     @property

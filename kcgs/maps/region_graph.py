@@ -1,4 +1,4 @@
-"""The regions of a map as a graph: their areas and borders, and merging of neighbours that are too many."""
+"""The regions of a map as a graph: their areas and borders, and the merging of neighbours."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def pairs_to_merge(image: Tensor, labels: Tensor, max_regions: int) -> list[tupl
 
 
 class RegionGraph:
-    """The regions 0 to R - 1: their areas, and along how many pixel sides they touch; regions merge in place.
+    """The regions 0 to R - 1: their areas, and the number of pixel sides that two share; regions merge in place.
 
-    With objects, a second map of which no region crosses a contour, regions of different objects are no neighbours.
+    `objects` is a second map whose contours no region crosses; regions of different objects are no neighbours.
     """
 
     def __init__(self, labels: Labels, objects: Labels | None = None) -> None:
@@ -64,7 +64,7 @@ class RegionGraph:
         self.borders[source] = {}
 
     def roots(self) -> Labels:
-        """Return for every region the one that it is now part of."""
+        """Return for every region the region that it is now part of."""
         roots = self._parents
         while (roots != roots[roots]).any():
             roots = roots[roots]
@@ -72,9 +72,10 @@ class RegionGraph:
 
 
 def merge_nearest(graph: RegionGraph, sums: NDArray[np.float64], max_regions: int, by_error: bool = False) -> None:
-    """Merge the nearest pair of neighbours while there are too many regions; `sums` holds colours times areas, (R, C).
+    """Merge the nearest neighbours while there are too many regions; `sums` holds colours times areas, (R, C).
 
-    The distance is that of mean colours, or with `by_error` the rise of the squared error of flat colours.
+    The distance of two regions is that of their mean colours; with `by_error`, the rise of the squared error of flat
+    colours.
     """
 
     def distance(a: int, b: int) -> float:

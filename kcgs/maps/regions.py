@@ -1,4 +1,4 @@
-"""RegionMap: a label map made ready for rendering, and everything that is done to one."""
+"""RegionMap: a label map made ready for rendering, and the operations on it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ from .table import MapTable, full_map
 from .tiles import with_tiles
 from .widths import blurs_of, find_widths
 
-# of the tiles that a map keeps: 1 GiB; every render makes those of a map of noise, which a small file may hold
+# largest number of planes that a map keeps, 1 GiB; every render makes the tiles of a larger map, as a small file of
+# noise may hold
 _MOST_PLANES = 1 << 20
 
 
@@ -41,8 +42,8 @@ class RegionMap:
     Convention: ids are any non-negative integers. With ``softness`` 0 a pixel belongs to its label alone (the paper's
     rule). Above 0 the membership of region r is the blur of [M = r] by a Gaussian of that standard deviation, cut at
     4 standard deviations, normalised to sum to one: pixels farther than that from a contour are unchanged. With a
-    softness for each pair of regions a pixel is blurred by that of its nearest contour. A map has a copy of the labels
-    it was made from, and ``labels`` gives copies of that: whatever writes to them changes no render.
+    softness for each pair of regions a pixel is blurred by the softness of its nearest contour. A map copies its
+    labels, and ``labels`` returns a copy: to write to either changes no render.
 
     Example:
         >>> regions = RegionMap(torch.tensor([[3, 3, 7], [3, 7, 7]]))
@@ -53,7 +54,7 @@ class RegionMap:
     _labels: Tensor
     _softness: Softness
     _index: Tensor  # [maps, H, W] int32
-    _table: MapTable  # of the map, or of the one that it was interpolated from
+    _table: MapTable  # of the map, or of the map that it was interpolated from
     _source: RegionMap | None  # the map that this one was interpolated from
 
     def __init__(self, labels: Any, softness: GivenSoftness = 0.0) -> None:
@@ -76,7 +77,7 @@ class RegionMap:
             >>> RegionMap(edge, {(2, 1): 0.7}).softness
             0.7
         """
-        with torch.inference_mode(False):  # a graph of autograd keeps no tensor of that mode
+        with torch.inference_mode(False):  # autograd saves no tensor of inference mode
             self._fill(check_labels("labels", labels).clone(), softness)
 
     def _fill(self, labels: Tensor, softness: GivenSoftness) -> None:
@@ -91,12 +92,12 @@ class RegionMap:
         self._table = with_tiles(MapTable(labels, blurs, pixels, ids, self._index), _MOST_PLANES)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Leave out what is derived: torch moves the memory of tensors that it sends to another process."""
+        """Pickle no derived tensors: torch moves the memory of each tensor that it sends to another process."""
         labels = self._labels if self._source is None else self._source._labels
         return RegionMap.from_state, ({**self.state(), "labels": labels},)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> RegionMap:
-        """Return the map itself, which nothing changes."""
+        """Return the map itself: it is immutable."""
         return self
 
     def __repr__(self) -> str:
@@ -121,7 +122,7 @@ class RegionMap:
 
     @property
     def softness(self) -> Softness:
-        """Softness of all contours in pixels, or that of each pair of regions; a tuple where maps of a batch differ."""
+        """Softness of all contours in pixels, or of each pair of regions; a tuple where maps of a batch differ."""
         return self._softness
 
     @property
@@ -188,7 +189,7 @@ class RegionMap:
 
     @classmethod
     def stack(cls, maps: Sequence[RegionMap]) -> RegionMap:
-        """Make a batch of maps of one image each, with the softness of each; an index is the reverse.
+        """Make a batch of maps of one image each; each keeps its softness, and ``batch[k]`` returns map k.
 
         Args:
             maps: at least one, all of one size.
@@ -207,14 +208,14 @@ class RegionMap:
         return cls(torch.stack([one._labels for one in maps]), [one._softness for one in maps])  # type: ignore[misc]
 
     def relabel(self, labels: Tensor, new_contours: Literal["hard", "mean"] = "hard") -> RegionMap:
-        r"""Make the map of other labels, with the softness of this one.
+        r"""Make the map of other labels, with the softness of this map.
 
         Where pairs of regions have a softness, pairs whose ids remain keep theirs.
 
         Args:
             labels: integer, the shape of `labels`.
-            new_contours: softness of pairs that touch in the new map only, and have none: 0, or the mean over all
-                pairs. Not read where one softness holds for all.
+            new_contours: softness of pairs that touch only in the new map and have none: 0 ("hard"), or the mean over
+                all pairs ("mean"). Ignored where all contours have one softness.
 
         Raises:
             TypeError, ValueError: as :meth:`from_labels`; labels of another shape.
@@ -227,7 +228,7 @@ class RegionMap:
         labels = check_labels("labels", labels)
         if labels.shape != self._labels.shape:
             raise ValueError(f"labels must have shape {tuple(self._labels.shape)}; got {tuple(labels.shape)}")
-        if not self._labels.is_cpu:  # a device would be waited for at every step
+        if not self._labels.is_cpu:  # the host would wait for the device at every step
             return self.to("cpu").relabel(labels.cpu(), new_contours).to(self._labels.device)
         softness: Any = self._softness
         if new_contours == "mean":
@@ -235,7 +236,7 @@ class RegionMap:
         return self._with_labels(labels, softness)
 
     def merge(self, pairs: Iterable[tuple[int, int]]) -> tuple[RegionMap | None, Tensor]:
-        """Merge pairs of regions to the least of their ids; softness is the mean over the contours that become one.
+        """Merge pairs of regions to the least of their ids; contours that become one have their mean softness.
 
         Args:
             pairs: ids in the map.
@@ -268,11 +269,11 @@ class RegionMap:
         return self._with_tensors(Tensor.cuda)
 
     def pin_memory(self) -> RegionMap:
-        """Return the map in page-locked memory, as a DataLoader does with what it loads."""
+        """Return the map in page-locked memory; a DataLoader with ``pin_memory=True`` calls this."""
         return self._with_tensors(Tensor.pin_memory)
 
     def _with_tensors(self, function: Callable[[Tensor], Tensor]) -> RegionMap:
-        """Return the map with a function of each of its tensors in place of that."""
+        """Return the map with a function applied to each of its tensors."""
         if self._source is not None:
             return self._source._with_tensors(function).resize(self.size)
         regions = RegionMap.__new__(RegionMap)
@@ -283,7 +284,7 @@ class RegionMap:
         return regions
 
     def __getitem__(self, index: int | slice) -> RegionMap:
-        """Copy one map of a batch, or a slice of it, with the regions that it has.
+        """Copy one map of a batch, or a slice of the batch, with only the regions that occur in it.
 
         Raises:
             ValueError: the map is not batched.
@@ -302,7 +303,7 @@ class RegionMap:
 
     @staticmethod
     def _with_labels(labels: Tensor, softness: Any) -> RegionMap:
-        """Make the map of these labels, without the softness of pairs that they do not have."""
+        """Make the map of these labels; the softness of pairs that they do not hold is dropped."""
         return RegionMap(labels, for_each(softness, softness_of_labels, labels))
 
     def state(self) -> dict[str, Any]:
@@ -329,11 +330,11 @@ class RegionMap:
     def resize(self, size: tuple[int, int]) -> RegionMap:
         r"""Sample the map at another resolution; contours are smooth curves, not stairs.
 
-        A contour is as wide as the fitted one, enlarged, without the blur of the map's pixels, and as one pixel of the
-        new map: sharp where it was sharp, soft where it was soft. ``softness`` says how wide. All regions remain, and
-        lines one pixel wide stay about that wide; ``labels`` are those of the nearest pixels. The same size gives the
-        same map. A smaller map takes no area means: the renderer takes them of the image. docs/concepts.md has the
-        formula.
+        A contour has the blur of the fitted contour, less the blur of the map's pixels, enlarged, plus the blur of a
+        pixel of the new map: sharp contours stay sharp, soft contours stay soft. ``softness`` is the blur of the new
+        contour. All regions remain, and lines one pixel wide stay about that wide; ``labels`` are those of the nearest
+        pixels. The same size gives the same map. A smaller map takes no area means: the renderer takes them of the
+        image. docs/concepts.md has the formula.
 
         Args:
             size: (height, width).
@@ -360,7 +361,7 @@ class RegionMap:
 
 
 def wrap_labels(labels: Tensor, softness: GivenSoftness) -> RegionMap:
-    """Make the map of valid int64 labels without a copy: nobody else may write to them."""
+    """Make the map of valid int64 labels without a copy; the caller must not write to them."""
     regions = RegionMap.__new__(RegionMap)
     regions._fill(labels, softness)
     return regions

@@ -1,4 +1,4 @@
-"""Membership of a map at another size: of smooth contours, as soft as the map's, and one pixel of the new size."""
+"""Membership of a map at another size: its contours are smooth, and as soft as the map's and a new pixel together."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from .tile import TILE
 from .tiles import to_array, with_smooth_tiles
 from .widths import blurs_of
 
-# windows of a task
+# windows per task
 _TASK_WINDOWS = 32
 # pixels of windows and tiles that are evaluated at once: 16 MiB in float64
 _CHUNK_PIXELS = 1 << 21
 # least blur of antialiased labels, in pixels of the map
 LEAST_BLUR = 0.7
-# squared width of a pixel: its standard deviation is a half
+# squared width of a pixel: it counts as a standard deviation of half a pixel
 PIXEL = 1 / 4
 
 
 class SmoothMembership(Membership):
-    """Membership of antialiased labels: what is interpolated between the pixels of a map, on the CPU.
+    """Membership of antialiased labels, on the CPU; `Resampled` interpolates it between the pixels of a map.
 
-    Labels are blurred by the softness of contours, but by `LEAST_BLUR` at least. Weights do not sum to one.
+    Labels are blurred by the softness of contours, at least by `LEAST_BLUR`. Weights do not sum to one.
     """
 
     margin = 1
@@ -73,15 +73,15 @@ class _Axis(NamedTuple):
 class Resampled(Membership):
     """Membership of a map at another size.
 
-    A point between the centres of four pixels has u_r, the bilinear mean of their weights in :class:`SmoothMembership`;
-    beyond the outermost centres the border repeats. Its membership is s_r = u_r**e / (sum of all u**e). With v, the
-    squared softness of contours, interpolated as u is, and s, the number of new pixels per pixel of the map,
-    e**2 = (max(v, LEAST_BLUR**2) + 1/4) s / (max(v - 1/4, 0) s + 1/4): the contour is as wide as the fitted one,
-    without the blur of the map's pixels, and as a pixel of the new size, half of which is a standard deviation.
+    u_r at a point is the bilinear mean of the weights of the four pixels around it in :class:`SmoothMembership`; beyond
+    the outermost centres the border repeats. The membership is s_r = u_r**e / (sum of all u**e). The exponent is
+    e**2 = (max(v, LEAST_BLUR**2) + 1/4) s / (max(v - 1/4, 0) s + 1/4), where v is the squared softness of contours,
+    interpolated as u is, and s the number of new pixels per pixel of the map. So the variance of a contour is that of
+    the fitted contour, less 1/4 for a pixel of the map, enlarged, plus 1/4 for a pixel of the new size.
     """
 
     def __init__(self, smooth: SmoothMembership, size: tuple[int, int]) -> None:
-        """Take what is interpolated, and a size."""
+        """Take the membership that is interpolated, and a size."""
         source, table = smooth.source, smooth.source.table
         index = sample_labels(source.index, *size)
         labels = sample_labels(table.labels.view(table.shape), *size)
@@ -141,7 +141,7 @@ class Resampled(Membership):
         planes = torch.zeros(len(shared), TILE * TILE, dtype=torch.float64)
         length = max(1, _CHUNK_PIXELS // (math.prod(spans) + TILE * TILE))
         variances = self.source.variances.cpu()
-        for chunk in _chunks(tile[shared], length):  # all regions of a tile are in one
+        for chunk in _chunks(tile[shared], length):  # all regions of a tile are in one chunk
             pairs = shared[chunk]
             t, position = tile[pairs].unique_consecutive(return_inverse=True)
             y, x = down[row[t]], across[col[t]].mT
@@ -160,9 +160,9 @@ class Resampled(Membership):
 
 
 def find_windows(table: MapTable, places: Tensor, span: Sequence[int]) -> tuple[Tensor, Tensor]:
-    """List the regions of windows of `span` pixels at places, (T, 3): the window of each, ascending, and the region.
+    """List pairs of a window and a region, windows ascending, for windows of `span` pixels at places, (T, 3).
 
-    Places are map, first row and first column. Regions are those of the tiles that a window touches.
+    Places are map, first row and first column. A window has the regions of the tiles that it touches.
     """
     from .loops import list_window_regions  # loads numba
 
@@ -197,19 +197,19 @@ def _read(pixels: Tensor, places: Tensor, span: Sequence[int]) -> Tensor:
 
 
 def contour_variance(variance: Numbers, ratio: float | Numbers) -> Numbers:
-    """Return the squared width, in pixels of the new size, for that in pixels of the map."""
+    """Convert the squared width of a contour from pixels of the map to pixels of the new size."""
     return (variance - PIXEL).clamp_min(0) * ratio + PIXEL
 
 
 def sharpness(variance: Numbers, ratio: float | Numbers) -> Numbers:
     """Evaluate the exponent e of :class:`Resampled` for squared widths in pixels of the map; `ratio` is its s."""
     new_variance = contour_variance(variance, ratio)
-    blurred = variance.clamp_min(LEAST_BLUR**2) + PIXEL  # what antialiasing and interpolation add
+    blurred = variance.clamp_min(LEAST_BLUR**2) + PIXEL  # variance after antialiasing and interpolation
     return (blurred * ratio / new_variance).sqrt()
 
 
 def _sharpen(weights: Tensor, position: Tensor, exponent: Tensor) -> Tensor:
-    """Raise the weights of each tile, (P, n, n), to a power, and let them sum to one; `position` counts the tiles."""
+    """Raise weights, (P, n, n), to a power, and normalise their sum over a tile; `position` is the tile of each."""
     largest = weights.new_zeros(int(position[-1]) + 1, *weights.shape[1:])
     total = torch.zeros_like(largest)
     largest.scatter_reduce_(0, position.view(-1, 1, 1).expand_as(weights), weights, "amax")
@@ -239,7 +239,7 @@ def _axis(new: int, old: int, tile: int) -> _Axis:
 
 
 def _matrix(axis: _Axis, first: Tensor, span: int) -> Tensor:
-    """Return the matrix from the pixels of a window to the new ones between them, (tiles, n, span)."""
+    """Return the matrices that interpolate new pixels from the pixels of windows, (tiles, n, span)."""
     pixel = torch.arange(span) + first.view(-1, 1, 1)
     low, high = (side.reshape(len(first), -1, 1) == pixel for side in axis[:2])
     weight = axis.weight.reshape(len(first), -1, 1)

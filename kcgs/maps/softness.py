@@ -1,4 +1,4 @@
-"""Softness of contours, in pixels: one number, or one for each pair of regions; and either for each map of a batch."""
+"""Softness of contours, in pixels: one number, or one per pair of regions; a batch may have either for each map."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .resampled import contour_variance
 T = TypeVar("T")
 
 MAX_SOFTNESS = 64.0  # pixels: a wider blur is no contour
-_PRINTED_PAIRS = 4  # of a repr
+_PRINTED_PAIRS = 4  # most pairs that a repr lists
 
 
 class PairSoftness(Mapping[tuple[int, int], float]):
@@ -51,20 +51,20 @@ class PairSoftness(Mapping[tuple[int, int], float]):
 
 Pairs = Mapping[tuple[int, int], float]
 OneSoftness = float | PairSoftness
-# that of all maps, or of each map of a batch
+# softness of all maps, or of each map of a batch
 Softness = OneSoftness | tuple[OneSoftness, ...]
 # as users give it
 GivenSoftness = float | Pairs | Sequence[float | Pairs]
 
 
 def check_softness(softness: object, ids: Tensor, index: Tensor, is_batch: bool) -> Softness:
-    """Return one number where all pairs have the same softness, else that of each pair; one for all maps if they agree.
+    """Return softness as one number where all pairs agree, else per pair; per map only where maps of a batch differ.
 
     Args:
         softness: as users give it.
         ids: of the map or the batch, sorted.
         index: position of each pixel's label among them, (maps, H, W).
-        is_batch: whether there may be one for each map.
+        is_batch: whether each map may have its own softness.
     """
     if not isinstance(softness, list | tuple):
         return _check_one(softness, ids)
@@ -95,7 +95,7 @@ def _check_one(softness: object, ids: Tensor) -> OneSoftness:
 
 
 def softness_by_position(softness: OneSoftness, ids: Tensor) -> float | dict[tuple[int, int], float]:
-    """Return softness with the places of ids among the sorted ones in place of ids."""
+    """Return softness with every id replaced by its position among the sorted ids."""
     if not isinstance(softness, PairSoftness):
         return softness
     position = {region: place for place, region in enumerate(ids.tolist())}
@@ -103,7 +103,7 @@ def softness_by_position(softness: OneSoftness, ids: Tensor) -> float | dict[tup
 
 
 def scaled_softness(softness: OneSoftness, ratio: float) -> OneSoftness:
-    """Return the softness of a map with so many new pixels per pixel, as rendered, at most `MAX_SOFTNESS`."""
+    """Return the softness as rendered at `ratio` new pixels per pixel of the map, at most `MAX_SOFTNESS`."""
     if not isinstance(softness, PairSoftness):
         return _scaled(softness, ratio)
     return PairSoftness({pair: _scaled(value, ratio) for pair, value in softness.items()})
@@ -115,7 +115,7 @@ def _scaled(softness: float, ratio: float) -> float:
 
 
 def merged_softness(softness: OneSoftness, merged_id: Callable[[int], int]) -> float | Mapping[tuple[int, int], float]:
-    """Return the softness where regions merge: that of a contour is the mean over the pairs it is made of."""
+    """Return the softness after a merge: a contour has the mean softness of the pairs that it is made of."""
     if isinstance(softness, float):
         return softness
     parts: dict[tuple[int, int], list[float]] = {}
@@ -127,7 +127,7 @@ def merged_softness(softness: OneSoftness, merged_id: Callable[[int], int]) -> f
 
 
 def extended_softness(softness: OneSoftness, labels: Tensor, old_labels: Tensor) -> float | Pairs:
-    """Return the softness of other labels: pairs that touch there, and did not before, have the mean of all."""
+    """Return the softness of other labels: pairs that touch only there get the mean, unless they have a softness."""
     if isinstance(softness, float):
         return softness
     mean = sum(softness.values()) / len(softness)
@@ -135,7 +135,7 @@ def extended_softness(softness: OneSoftness, labels: Tensor, old_labels: Tensor)
 
 
 def softness_of_labels(softness: OneSoftness | Mapping[tuple[int, int], float], labels: Tensor) -> Any:
-    """Return the softness without the pairs of regions that labels do not have."""
+    """Return the softness without pairs of regions that the labels do not hold."""
     if not isinstance(softness, Mapping):
         return softness
     ids = set(labels.unique_consecutive().unique().tolist())  # sorting all pixels takes ten times as long
@@ -143,21 +143,21 @@ def softness_of_labels(softness: OneSoftness | Mapping[tuple[int, int], float], 
 
 
 def for_each(softness: Softness, function: Callable[..., T], *parts: Iterable[Any]) -> T | tuple[T, ...]:
-    """Apply a function to the softness of all maps, or to that of each with its other arguments."""
+    """Apply a function to the softness of all maps, or to the softness and other arguments of each map."""
     if not isinstance(softness, tuple):
         return function(softness, *parts)
     return tuple(function(*arguments) for arguments in zip(softness, *parts, strict=True))
 
 
 def softness_to_plain(softness: Softness) -> Any:
-    """Return softness as JSON has it: a number, triples of two ids and a number, or under "maps" a list of either."""
+    """Return softness for JSON: a number, a list of [id, id, number], or {"maps": a list of either}."""
     if isinstance(softness, tuple):
         return {"maps": [softness_to_plain(part) for part in softness]}
     return softness if isinstance(softness, float) else [[*pair, width] for pair, width in softness.items()]
 
 
 def softness_from_plain(plain: Any) -> Any:
-    """Return what `softness_to_plain` was given, as users give it."""
+    """Return the softness, as users give it, that `softness_to_plain` described."""
     if isinstance(plain, dict):
         return [softness_from_plain(part) for part in plain["maps"]]
     return {(low, high): value for low, high, value in plain} if isinstance(plain, list) else plain

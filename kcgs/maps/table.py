@@ -15,16 +15,17 @@ from .tile import TILE
 
 
 class MapTable(NamedTuple):
-    """A label map as tensors; of labels alone the others are None, until `with_positions` and `with_tiles` make them.
+    """A label map as tensors; in a table of labels alone, all others are None.
 
-    `TILE_FIELDS` say which regions occur in which tile of 16 pixels, and the membership of its pixels where a tile has
-    several. Tiles are numbered in raster order, map first. Weights beyond the image have no meaning.
+    `with_positions` adds ids and positions, `with_tiles` adds `TILE_FIELDS`: the regions of each tile of 16 pixels, and
+    the membership of its pixels where a tile has several. Tiles are numbered in raster order, map first. Weights beyond
+    the image have no meaning.
 
-    To add a field, add it here, and to `PER_MAP` or `SHARED` where it cannot be made of the others: the operator's
+    To add a field, add it here, and to `PER_MAP` or `SHARED` if it cannot be made from the other fields: the operator's
     schema, arguments and vmap follow.
     """
 
-    labels: Tensor  # [H, W] or [maps, H, W] int64; nobody writes to those of a RegionMap
+    labels: Tensor  # [H, W] or [maps, H, W] int64; a RegionMap's are never written to
     blurs: Tensor | None = None  # [widths, 2 + reach] float64, as of `blurs_of`, ascending; None: hard contours
     width_index: Tensor | None = None  # [maps, H, W] int32, row of `blurs` for each pixel; None: the first
     ids: Tensor | None = None  # [R] int64, sorted
@@ -53,7 +54,7 @@ class MapTable(NamedTuple):
 
     @property
     def widths(self) -> tuple[float, ...]:
-        """The widths of contours, in pixels; a device is waited for."""
+        """The widths of contours in pixels; the host waits for the device."""
         return (0.0,) if self.blurs is None else tuple(self.blurs[:, 0].tolist())
 
     @property
@@ -73,7 +74,7 @@ class MapTable(NamedTuple):
         return self.replace_tiles([None] * len(TILE_FIELDS))
 
 
-# what all other fields can be made of: fields that have a part for each map, and those that all maps share
+# the fields from which all others can be made: those with a part for each map, and those that all maps share
 PER_MAP = ("labels", "width_index")
 SHARED = ("blurs",)
 # the regions of tiles, and the membership of their pixels
@@ -81,7 +82,7 @@ TILE_FIELDS = ("starts", "regions", "planes", "weights")
 
 
 def with_positions(table: MapTable) -> MapTable:
-    """Return a table with ids and positions; labels alone are checked."""
+    """Return a table with ids and positions; a table of labels alone is checked."""
     if table.ids is not None:
         return table
     labels = table.labels

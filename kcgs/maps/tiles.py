@@ -15,7 +15,7 @@ from .table import MapTable, with_positions
 from .tile import TILE
 from .widths import blurs_of, reach_of
 
-# tiles of a task
+# tiles per task
 _TASK_TILES = 64
 _NONE = np.empty((0, 0, 0), np.int32)
 
@@ -26,7 +26,7 @@ def complete(table: MapTable) -> MapTable:
 
 
 def with_tiles(table: MapTable, most_planes: int | None = None) -> MapTable:
-    """Return a table, with ids, with its tiles; on the CPU without, where they have more planes than `most_planes`."""
+    """Add tiles to a table that has ids; on the CPU, return it without tiles if they exceed `most_planes` planes."""
     if table.starts is not None:
         return table
     assert table.positions is not None
@@ -40,12 +40,12 @@ def with_tiles(table: MapTable, most_planes: int | None = None) -> MapTable:
 
 
 def with_smooth_tiles(table: MapTable, smooth: SmoothLabels) -> MapTable:
-    """Return a table, with ids and on the CPU, with tiles of antialiased labels, in float64; see `SmoothMembership`."""
+    """Add float64 tiles of antialiased labels to a table that has ids, on the CPU; see `SmoothMembership`."""
     return _fill(table, _list_entries(table, 1), np.float64, tuple(map(to_array, smooth)))
 
 
 def _list_entries(table: MapTable, margin: int) -> tuple[Any, Any, Any]:
-    """Return starts, regions and planes as arrays; what is blurred reaches `margin` pixels farther than the labels."""
+    """Return starts, regions and planes as arrays; weights reach `margin` pixels beyond a label before the blur."""
     from .loops import list_regions  # loads numba
 
     assert table.positions is not None

@@ -1,4 +1,4 @@
-"""Widths of contours: of each pixel that of its nearest contour, by the two regions beside it."""
+"""Widths of contours: each pixel has the width of its nearest contour, which depends on the two regions beside it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LEAST_WIDTH = 1e-9
 _CHUNK_DISTANCES = 1 << 24
 # more than any image has rows
 _FAR = 1 << 24
-# more than any pair of regions
+# more than the key of any pair of regions
 _NO_KEY = 1 << 62
 
 
@@ -26,7 +26,7 @@ SoftnessByPosition = float | Mapping[tuple[int, int], float]
 
 
 class ContourWidths(NamedTuple):
-    """The widths of contours, and the one of each pixel."""
+    """The widths of contours, and the width of each pixel."""
 
     widths: tuple[float, ...]  # pixels, ascending
     pixels: Tensor | None  # [maps, H, W] int32, position in `widths`; None: one width everywhere
@@ -40,7 +40,7 @@ def reach_of(width: float) -> int:
 def truncated_gaussian(distance: Tensor, width: Tensor | float) -> Tensor:
     """Evaluate exp(-0.5 (distance / width)^2) up to `RADIUS_SIGMAS` widths, rounded up to whole pixels, and 0 beyond.
 
-    A width of 0 has 1 at distance 0. Distances are not negative, and floating where the width is a number.
+    Width 0 gives 1 at distance 0. Distances are not negative, and floating where the width is a number.
     """
     if isinstance(width, Tensor):
         is_near, ratio = distance <= (RADIUS_SIGMAS * width).ceil(), distance / width.clamp_min(_LEAST_WIDTH)
@@ -50,9 +50,9 @@ def truncated_gaussian(distance: Tensor, width: Tensor | float) -> Tensor:
 
 
 def blurs_of(widths: Sequence[float], device: torch.device) -> Tensor:
-    """Return a row for each width, float64: the width, then half of its blur, from the middle; the shape says how far.
+    """Return a float64 row for each width: the width, then half of its blur, from the centre to the widest reach.
 
-    Other devices than the CPU are not waited for.
+    The host does not wait for the device.
     """
     width = torch.tensor(widths, dtype=torch.float64)[:, None]
     distance = torch.arange(reach_of(max(widths)) + 1, dtype=torch.float64)
@@ -62,17 +62,17 @@ def blurs_of(widths: Sequence[float], device: torch.device) -> Tensor:
 def find_widths(
     index: Tensor, num_regions: int, softness: SoftnessByPosition | tuple[SoftnessByPosition, ...]
 ) -> ContourWidths:
-    """Give each pixel the width of its nearest contour, on the map's device, which the host does not wait for.
+    """Give each pixel the width of its nearest contour, on the map's device; the host does not wait.
 
-    The nearest pixel that touches a contour has the same label: the way to another label crosses the contour earlier.
-    So the two regions are that pixel's, and that of the first of its neighbours that differs. Of pixels equally near
-    the leftmost counts, then the uppermost. Pixels that no contour reaches have any width.
+    The nearest pixel that touches a contour has the same label, since the way to another label crosses a contour
+    earlier. So the two regions of the contour are the region of that nearest pixel and the first other region beside
+    it. Of pixels equally near, the leftmost counts, then the uppermost. Pixels that no contour reaches have any width.
 
     Args:
         index: position of each pixel's region among the sorted ids, (maps, H, W) int32.
         num_regions: number of ids.
-        softness: the width in pixels, or that of each pair (a, b) of positions with a < b, 0 where absent; or one of
-            these for each map.
+        softness: the width in pixels, or the width of each pair (a, b) of positions with a < b, 0 where absent; or
+            either for each map.
     """
     if isinstance(softness, tuple):
         parts = [find_widths(one[None], num_regions, part) for one, part in zip(index, softness, strict=True)]
@@ -84,7 +84,7 @@ def find_widths(
 
 
 def _join_widths(parts: Sequence[ContourWidths], index: Tensor) -> ContourWidths:
-    """Return the widths of all maps of a batch, and the one of each pixel."""
+    """Return the widths of all maps of a batch, and the width of each pixel."""
     widths = sorted({width for part in parts for width in part.widths})
     pixels = torch.empty_like(index)
     for k, part in enumerate(parts):
@@ -95,7 +95,7 @@ def _join_widths(parts: Sequence[ContourWidths], index: Tensor) -> ContourWidths
 
 
 def spread_widths(index: Tensor, num_regions: int, softness: Mapping[tuple[int, int], float]) -> ContourWidths:
-    """Find the widths on the CPU; those that no contour has go."""
+    """Find the widths on the CPU; widths that no contour has are dropped."""
     from .nearest import spread  # loads numba
 
     other = _neighbor_labels(index).numpy()
@@ -130,7 +130,7 @@ def _neighbor_labels(index: Tensor) -> Tensor:
     height, width = index.shape[1:]
     padded = torch.nn.functional.pad(index, (1, 1, 1, 1), value=-1)
     other = torch.full_like(index, -1)
-    for down, across in ((2, 1), (1, 2), (1, 0), (0, 1)):  # the first one overwrites the others
+    for down, across in ((2, 1), (1, 2), (1, 0), (0, 1)):  # in reverse order: the first neighbour is written last
         beside = padded[:, down : down + height, across : across + width]
         other = torch.where((beside >= 0) & (beside != index), beside, other)
     return other
@@ -153,9 +153,9 @@ def _nearest_rows(touches: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _nearest_columns(down: Tensor, reach: int) -> tuple[Tensor, Tensor]:
-    """Return the column of the nearest marked pixel for the distances of those within columns, and whether it is near.
+    """Return the column of the nearest marked pixel, and whether it is near; `down` has the distances within columns.
 
-    A contour that lies within reach along both axes is near; none is searched farther along one of them.
+    Near is a distance below floor(sqrt(2) reach) + 1, so that a contour within reach along both axes is near.
     """
     maps, _, width = down.shape
     limit = math.floor(math.sqrt(2) * reach) + 1
