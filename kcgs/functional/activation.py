@@ -10,16 +10,16 @@ from torch import Tensor
 from kcgs._check import check_floating, check_number
 from kcgs.errors import InvalidArgument
 
-# widest and narrowest factor, in half spacings: one and its inverse
+# largest factor in half spacings; the smallest is its inverse
 _SCALE_RANGE = 8.0
 
 
 def activate_gaussians(raw: Tensor, anchors: Tensor, spacing: float) -> tuple[Tensor, Tensor, Tensor]:
     r"""Turn any real numbers, such as a network's output, into valid Gaussians near their anchors.
 
-    Convention: zeros are a round Gaussian at its anchor, whose standard deviation is half the spacing, in black. In
-    units of the spacing d, means lie within d of the anchor along x and along y, l11 and l22 in [d / 16, 4 d], and l21
-    in [-4 d, 4 d]. Colours are taken as they are: on a grid, the weights at a pixel add up to about pi / 2.
+    Convention: zeros give a round black Gaussian at its anchor, with a standard deviation of half the spacing. With the
+    spacing d, means lie within d of the anchor along x and along y, l11 and l22 in [d / 16, 4 d], and l21 in
+    [-4 d, 4 d]. Colours are not changed: on a grid, the weights at a pixel add up to about pi / 2.
 
     Args:
         raw: two numbers of the mean, three of the factor, C of the colour, finite, :math:`(..., N, 5 + C)`.

@@ -1,4 +1,4 @@
-"""What the operator `kcgs::region_splat` takes."""
+"""The arguments of the operator `kcgs::region_splat`."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from torch import Tensor
 
 from kcgs.maps import MapTable
 
-# places of the table among the arguments, and of what follows
+# positions in the schema of the table's first field, and of the argument after the table
 _TABLE = 4
 _END = _TABLE + len(MapTable._fields)
-# of the operator, which takes the fields of a table one by one, as all operators of torch do
+# the operator takes the fields of a table one by one, since operators of torch take no NamedTuple
 SCHEMA = (
     "Tensor means, Tensor cholesky, Tensor colors, Tensor? region_ids, "
     + ", ".join(f"Tensor? {name}" for name in MapTable._fields)
@@ -23,7 +23,7 @@ NUM_ARGUMENTS = _END + 4
 class SplatArguments(NamedTuple):
     """The arguments of the operator; floating tensors share one dtype, float32 or float64.
 
-    For one image B may be left out of means, cholesky, colors and region_ids together, and so of the image.
+    For one image B may be left out of means, cholesky, colors and region_ids together; the image then has no B either.
     """
 
     means: Tensor  # [B, N, 2]

@@ -17,7 +17,7 @@ def gaussian_taps(sigma: float, radius: int) -> list[float]:
 
 
 def blur(maps: Tensor, taps: Sequence[float]) -> Tensor:
-    """Filter (..., H, W) along both sides, one after the other, where the window lies inside.
+    """Filter (..., H, W) along one axis, then along the other, at positions where the window lies inside.
 
     Args:
         maps: floating.
@@ -26,13 +26,13 @@ def blur(maps: Tensor, taps: Sequence[float]) -> Tensor:
     Returns:
         (..., H - 2k, W - 2k) for k + 1 taps.
     """
-    if torch.compiler.is_compiling():  # where a function with a jvp is not known
+    if torch.compiler.is_compiling():  # torch.compile knows no function with a jvp
         return _filter(maps, taps)
     return torch.as_tensor(_Blur.apply(maps, tuple(taps)))  # type: ignore[no-untyped-call]
 
 
 def halve(planes: Tensor) -> Tensor:
-    """Average blocks of 2 x 2, (..., h, w), without an odd last row; five times faster on one core than torch's."""
+    """Average blocks of 2 x 2, (..., h, w), without an odd last row; on one core five times faster than in torch."""
     rows = planes[..., : planes.shape[-2] // 2 * 2 : 2, :] + planes[..., 1::2, :]
     return (rows[..., : rows.shape[-1] // 2 * 2 : 2] + rows[..., 1::2]).mul_(0.25)
 

@@ -1,9 +1,9 @@
 """Fit two colours across each contour: how soft the contour is, and how much error it explains.
 
-Along a contour lie square windows. In each the image is explained as sum_r s_r F_r, with s_r the memberships at one
-softness and F_r linear in x and y: a least-squares problem with a closed form. Mixed pixels are thereby explained as
-mixtures and spoil no colour, and a thin region needs no pure pixel. The softness with the least error summed over the
-windows of a pair of regions is that pair's.
+Along a contour lie square windows. In each window the image is explained as sum_r s_r F_r, with s_r the memberships at
+one softness and F_r linear in x and y: a least-squares problem with a closed form. Mixed pixels are explained as
+mixtures, so that they spoil no colour, and a thin region needs no pure pixel. A pair of regions gets the softness with
+the least error, summed over its windows.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ _MIN_EDGES = 12  # pixel edges that a pair needs to be judged by itself
 
 _HALF = 6  # pixels that a window reaches from its centre, or twice the largest candidate if that is more
 _CELL = 6  # pixels: one window for each cell of this side that the contour of a pair crosses
-_PAIR_WINDOWS = 512  # for one pair of regions, evenly spread; bounds the time
-_ALL_WINDOWS = 4096  # for a map
+_PAIR_WINDOWS = 512  # most windows of one pair of regions, evenly spread; it bounds the time
+_ALL_WINDOWS = 4096  # most windows of a map
 _CHUNK_ELEMENTS = 1 << 18  # label pixels in a chunk of windows: small enough for the cache
 _GPU_CHUNK_ELEMENTS = 1 << 22  # on a GPU, where each chunk takes two hundred operations
-# Noise of 0.02 against colours and slopes (over half a window) of 0.3: keeps a region that hardly shows from
-# explaining everything with an absurd colour.
+# noise of 0.02, and colours and slopes (over half a window) of 0.3: the ridge keeps a region that hardly shows from
+# explaining everything with an absurd colour
 _RIDGE = (0.02 / 0.3) ** 2
 _TIE = 1e-7  # mean squared error that counts as none: a tenth of the rounding of 8-bit images
 
 
 class ContourGain(NamedTuple):
-    """Mean squared error along a contour, with it and without it."""
+    """Mean squared errors along a contour: with the contour, and without it."""
 
     contour_error: float
-    """Of two linear colours mixed across the contour, at the best softness."""
+    """Error of two linear colours mixed across the contour, at the best softness."""
     smooth_error: float
-    """Of one quadratic colour, which has as many coefficients."""
+    """Error of one quadratic colour, which has as many coefficients."""
     share: float
-    """The share of that error that the contour saves, at most 1; three in four windows along it save more."""
+    """Share of the smooth error that the contour saves, at most 1; three in four windows along it save more."""
 
 
 class _Windows(NamedTuple):
@@ -70,13 +70,13 @@ def choose_softness(
 ) -> dict[tuple[int, int], float]:
     r"""Choose the softness of the contour between each two neighbouring regions that explains the image best.
 
-    Convention: softness is the standard deviation of the blur of [M = r], as in `RegionMap`. The least candidate wins
-    where others gain less than a mean square of 1e-7, a tenth of the rounding of 8-bit images. A winner between two
-    positive candidates is refined by a parabola to 0.05 pixels. Pairs with fewer than 12 pixel edges get the softness
-    that is best for all together.
+    Convention: softness is the standard deviation of the blur of [M = r], as in `RegionMap`. A smaller candidate wins
+    unless a larger one lowers the mean squared error by more than 1e-7, a tenth of the rounding of 8-bit images. A
+    winner between two positive candidates is refined by a parabola to 0.05 pixels. Pairs with fewer than 12 pixel edges
+    get the softness that is best for all pairs together.
 
     Known limits: softness near the largest candidate comes out low (2.5 as 2.4, and as 2.1 under noise and texture of
-    a sixth of the contrast). Where the two sides do not differ, it means nothing.
+    a sixth of the contrast). Where the two sides have the same colours, the result means nothing.
 
     Args:
         image: floating, :math:`(C, H, W)`, in [0, 1].
@@ -112,7 +112,7 @@ def contour_gain(image: Tensor, labels: Tensor) -> dict[tuple[int, int], Contour
 
     Convention: arguments and exceptions are those of :func:`choose_softness`. Errors are means over the pixels of the
     two regions within about 6 pixels of their contour, tapered, in squared units of the image. Pairs with fewer than 12
-    pixel edges get the mean of all together.
+    pixel edges get the values of all pairs together.
 
     Known limits: on 21 photos with human label maps, a share above 0.1 holds for 56 % of the pairs with at least 40
     pixel edges, and for 3 % where the map is mirrored.
@@ -155,7 +155,7 @@ def _best_softness(error: list[float], tie: float, levels: Sequence[float]) -> f
     best = next(i for i, e in enumerate(error) if e <= least + tie)
     if best in (0, len(error) - 1) or error[best] > least or levels[best - 1] == 0.0:
         return levels[best]
-    # Two edges blurred by v and w differ by about (sqrt(v) - sqrt(w))^2, summed over pixels. Nearer to 0 they do not.
+    # two edges blurred by v and w differ by about (sqrt(v) - sqrt(w))^2, summed over pixels, if neither is near 0
     (x0, x1, x2), (y0, y1, y2) = map(math.sqrt, levels[best - 1 : best + 2]), error[best - 1 : best + 2]
     left, right = (x1 - x0) * (y2 - y1), (x2 - x1) * (y0 - y1)
     if left + right <= tie:
@@ -186,7 +186,7 @@ def _measure(image: Tensor, labels: Tensor, levels: Sequence[float]) -> tuple[_W
 def check_problem(image: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
     """Return an image (C, H, W), and a label map of its size on the CPU.
 
-    Windows are summed where the image is: on a GPU in float64, whose products no setting of torch makes less exact.
+    Windows are summed on the image's device: on a GPU in float64, whose products no setting of torch makes less exact.
     """
     image = check_floating("image", image, dims=(3,))
     labels = check_labels("labels", labels, dims=(2,))
@@ -230,7 +230,7 @@ def _spread(group: Tensor, most: int) -> Tensor:
 
 
 def _blur_matrix(softness: float, side: int, halo: int) -> Tensor:
-    """Return the blur from `side + 2 halo` samples to the inner `side`."""
+    """Return the matrix that blurs `side + 2 halo` samples to the inner `side` samples."""
     distance = (torch.arange(side)[:, None] + halo - torch.arange(side + 2 * halo)).abs().float()
     return truncated_gaussian(distance, softness)
 
@@ -238,14 +238,14 @@ def _blur_matrix(softness: float, side: int, halo: int) -> Tensor:
 def _window_errors(pixels: Tensor, ids: Tensor, pairs: Tensor, kernels: list[Tensor]) -> _Errors:
     """Explain windows of pixels (K, side^2, C), with labels out to the blur's reach (-1: outside the image).
 
-    Sums over pixels are taken on their device; what is solved for each window is solved on the CPU.
+    Sums over pixels are taken on their device; the equations of each window are solved on the CPU.
     """
     side = kernels[0].shape[0]
     halo = (ids.shape[-1] - side) // 2
     inside = ids[:, None] == pairs[:, :, None, None]  # [K, 2, span, span]
     y, x = torch.meshgrid(*[torch.linspace(-1, 1, side, dtype=pixels.dtype, device=pixels.device)] * 2, indexing="ij")
     one, taper = torch.ones_like(x), torch.exp(-2 * (x * x + y * y))
-    # Pixels of other regions have no weight; what they blur into the pair's pixels is one more unknown colour.
+    # pixels of other regions have no weight; their blur into the pair's pixels is one more unknown colour
     weight = (taper * inside[..., halo : halo + side, halo : halo + side].any(1)).flatten(1)  # [K, side^2]
     pixels = pixels - (weight[..., None] * pixels).sum(1, keepdim=True) / weight.sum(1)[:, None, None]
     linear = torch.stack([one, x, y]).flatten(1)

@@ -120,7 +120,7 @@ def cholesky_to_scale_rotation(cholesky: Tensor) -> tuple[Tensor, Tensor]:
         (tensor([3., 1.]), 1.5708)
     """
     l11, l21, l22 = check_cholesky("cholesky", cholesky).unbind(-1)
-    # singular values of a 2 x 2 triangle: |s1 + s2|, |s1 - s2| without squaring
+    # s1 + s2 and |s1 - s2| of the singular values of a triangular 2 x 2 matrix, without squaring
     total = torch.hypot(l11 + l22, l21)
     spread = torch.hypot(l11 - l22, l21)
     large = 0.5 * (total + spread)

@@ -1,4 +1,4 @@
-"""`kcgs::region_splat` in standard operators: what `torch.onnx.export` puts in its place; docs/onnx.md has the whole.
+"""`kcgs::region_splat` in standard operators, by which `torch.onnx.export` replaces it; docs/onnx.md describes both.
 
 Three loops bound the memory, and no shape depends on values: over tiles, over the regions in the window of a tile, and
 over chunks of the Gaussians of a region that reach the tile. Bodies of loops are handed all tensors that they read.
@@ -25,22 +25,22 @@ class _TileGaussians(NamedTuple):
     """The Gaussians of an image, and the tile at which they are evaluated."""
 
     first: Tensor  # [] int64, row of the image's first Gaussian
-    num_gaussians: Tensor  # [] int64, N; the row after these is of no colour
+    num_gaussians: Tensor  # [] int64, N; the row after the last Gaussian has no colour
     middle: Tensor  # [2] x and y of the middle of the tile
     rows: Tensor  # [B (N + 1), 5 + C] frames and colours
 
 
 def decompose(*operands: Any) -> Tensor:
-    """Render as `kcgs::region_splat` does, whose arguments these are; to be traced, and slow in eager mode."""
+    """Render as `kcgs::region_splat` does, from its arguments; this is to be traced, and slow in eager mode."""
     arguments = SplatArguments.of(*operands)
     if arguments.means.ndim == 2:
         return decompose(*(None if t is None else t[None] for t in operands[:4]), *operands[4:]).squeeze(0)
-    # a graph that renders only: loops cannot all be differentiated
+    # the graph only renders: not all of its loops can be differentiated
     means, cholesky, colors = (t.detach() for t in arguments[:3])
     device, (batch, count, channels), (height, width) = means.device, colors.shape, arguments.size
     l11, l21, l22 = cholesky.unbind(-1)
     frame = torch.stack([*means.unbind(-1), 1 / l11, l21 / l11, 1 / l22], -1)
-    # one Gaussian more, of no colour and no region
+    # one more Gaussian, without colour and region
     rows = torch.nn.functional.pad(torch.cat([frame, colors], -1), (0, 0, 0, 1))
     ids = torch.zeros_like(means[..., 0], dtype=torch.int64) if arguments.region_ids is None else arguments.region_ids
     ids = torch.nn.functional.pad(ids, (0, 1), value=-1)
@@ -73,12 +73,12 @@ def decompose(*operands: Any) -> Tensor:
     _, tiles = torch.ops.higher_order.scan(render_tile, [torch.zeros_like(counts[0])], [numbers], tensors)
     image = tiles.reshape(batch, down, across, channels, _SIDE, _SIDE).permute(0, 3, 1, 4, 2, 5)
     image = image.reshape(batch, channels, down * _SIDE, across * _SIDE)
-    # by less than nothing, since shapes then stay plain: a slice would be of min(height, rows)
+    # crop by a negative pad, which keeps shapes plain: a slice would have min(height, rows) rows
     return torch.nn.functional.pad(image, (0, width - across * _SIDE, 0, height - down * _SIDE)).contiguous()
 
 
 def _mark_near(columns: Tensor, middle: Tensor, cutoff: float) -> Tensor:
-    """Mark the Gaussians whose support reaches a tile, [N + 1]; not the last, which is no Gaussian."""
+    """Mark the Gaussians whose support reaches a tile, [N + 1]; the last row is no Gaussian and is not marked."""
     x, y, inverse1, slope, inverse2 = columns.unbind()
     radius = support_radius(cutoff, x.dtype)
     z1, z2 = least_whitened(middle[0] - x, middle[1] - y, inverse1, slope, inverse2, _SIDE / 2)
@@ -94,7 +94,7 @@ def _sum_regions(
     black: Tensor,
     cutoff: float,
 ) -> Tensor:
-    """Add up the regions of a tile, in the order of their ids; `window` begins with these, sorted."""
+    """Add up the regions of a tile, in the order of their ids; `window` begins with the sorted ids."""
 
     def has_region(place: Tensor, total: Tensor, weight: Tensor, *tensors: Tensor) -> Tensor:
         return place < tensors[6].shape[0]
@@ -136,7 +136,7 @@ def _weights(frame: Tensor, middle: Tensor, cutoff: float) -> Tensor:
     """Evaluate the weights of K Gaussians at the pixels of a tile, [K, pixels]."""
     offsets = torch.arange(_SIDE, device=frame.device, dtype=frame.dtype) - (_SIDE - 1) / 2
     mean_x, mean_y, inverse1, slope, inverse2 = (v[:, None, None] for v in frame.unbind(1))
-    # pixel minus mean before anything is multiplied: nothing cancels where a Gaussian is far below a pixel wide
+    # the mean is subtracted before any product: nothing cancels where a Gaussian is much narrower than a pixel
     x = (middle[0] - mean_x) + offsets  # [K, 1, side]
     y = (middle[1] - mean_y) + offsets[:, None]  # [K, side, 1]
     z1, z2 = whiten(x, y, inverse1, slope, inverse2)

@@ -1,7 +1,7 @@
-"""What the operator computes: Gaussians and map are made ready for a kernel, which renders and differentiates them.
+"""The implementation of the operator: it prepares Gaussians and map for a kernel, which renders and differentiates.
 
-Everything here is below autograd. Values are checked here, since only an operator sees them; shapes are checked by the
-public function.
+Everything here is below autograd. Values are checked here, since a traced function does not see them; the public
+function checks shapes.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ class Evaluation(NamedTuple):
 
     kernel: Kernel
     inputs: SplatInputs
-    plan: Any  # in a form of the kernel's own
+    plan: Any  # in the kernel's own format
 
 
 def prepare(arguments: SplatArguments, check: bool = True) -> Evaluation:
-    """Prepare Gaussians and map for the kernel that the backend names, with `check` of values."""
+    """Prepare Gaussians and map for the kernel that the backend names, and `check` their values."""
     inputs, kernel = _make_inputs(arguments, check)
     plan = kernel.plan(inputs)
     if plan is None:
@@ -78,7 +78,7 @@ def squared_error_gradients(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the gradients of half the squared error of a render, summed over the pixels of an image, (..., C, H, W).
 
-    For descents: one pass over the image where the backend has it, no graph, and shapes are not checked.
+    It is for descents: one pass over the image where the backend can, without a graph and without checks of shapes.
     """
     table = None if regions is None else table_and_size(regions)[0]
     gaussians, size = (means.detach(), cholesky.detach(), colors.detach()), (image.shape[-2], image.shape[-1])
@@ -100,7 +100,7 @@ def differentiate_twice(
         image, leaves = _image_with_graph(arguments)
         leaves = [grad.detach().requires_grad_(), *leaves]
         first = torch.autograd.grad(image, leaves[1:], leaves[0], create_graph=True)
-        # without geometry its tangents are empty
+        # without geometry the tangents of means and factors are empty
         pairs = [(value, tangent) for value, tangent in zip(first, tangents, strict=True) if len(tangent)]
         values, weights = zip(*pairs, strict=True)
         second = torch.autograd.grad(values, leaves, weights, allow_unused=True, materialize_grads=True)
@@ -111,7 +111,7 @@ def differentiate_forward(tangents: tuple[Tensor, Tensor, Tensor], arguments: Sp
     """Differentiate the image along a change of the Gaussians."""
     with with_autograd():
         image, leaves = _image_with_graph(arguments)
-        # gradients are linear in the image's gradient: differentiated by that, they are the derivative forward
+        # the gradients are linear in `grad`: their derivative by `grad` is the forward derivative
         grad = torch.zeros_like(image, requires_grad=True)
         first = torch.autograd.grad(image, leaves, grad, create_graph=True)
         (derivative,) = torch.autograd.grad(first, grad, tangents)
@@ -119,7 +119,7 @@ def differentiate_forward(tangents: tuple[Tensor, Tensor, Tensor], arguments: Sp
 
 
 def _image_with_graph(arguments: SplatArguments) -> tuple[Tensor, list[Tensor]]:
-    """Render with a graph, and return its leaves, too."""
+    """Render with a graph; return the image and the graph's leaves."""
     inputs, kernel = _make_inputs(arguments, check=False)
     if kernel.image is None:
         raise RuntimeError(
@@ -146,21 +146,21 @@ def _make_inputs(arguments: SplatArguments, check: bool) -> tuple[SplatInputs, K
 
 
 def _look_up(inputs: SplatInputs, check: bool) -> SplatInputs:
-    """Put the positions of regions in place of their ids."""
+    """Replace the ids of regions by their positions."""
     if inputs.ids is None or inputs.region_index is None:
         return inputs
     index = _positions(inputs)
     known = index.device.type == "cpu" and int(index.numpy().min(initial=0)) >= 0
     if check and not known:
         check_region_ids(inputs.region_index, index)
-    # one region covers everything: no map, but Gaussians of other ids still paint nothing
+    # one region covers everything, and holds all Gaussians: no map is needed
     if len(inputs.ids) == 1 and known:
         return inputs._replace(region_index=None, table=None, ids=None)
     return inputs._replace(region_index=index, ids=None)
 
 
 def _check_ids(inputs: SplatInputs) -> None:
-    """Refuse negative region ids, and warn of those that the map does not hold."""
+    """Refuse negative region ids, and warn of ids that the map does not hold."""
     if inputs.ids is not None and inputs.region_index is not None:
         check_region_ids(inputs.region_index, _positions(inputs))
 

@@ -21,7 +21,7 @@ _LARGEST_EXPONENT = 64  # of memberships: float32 holds the powers
 class MapWindows:
     """A map at the size of an image, by tiles.
 
-    `tables` is computed once. Loops of a graph are handed all tensors that they read, and hand it to `read_tile`.
+    `tables` is computed once. A loop of a graph is handed all tensors that it reads; it passes `tables` to `read_tile`.
     """
 
     def __init__(self, table: MapTable, size: tuple[int, int], side: int, dtype: torch.dtype) -> None:
@@ -35,7 +35,7 @@ class MapWindows:
         taps = 1 if table.blurs is None else table.blurs.shape[1] - 1
         least = math.ceil(RADIUS_SIGMAS * LEAST_BLUR) if self.is_resized else 0
         self.reach = max(taps - 1, least)
-        # distance at which a region around a pixel may be a part of it: antialiasing reaches one pixel farther
+        # pixels around a pixel whose regions may have a part of it: antialiasing reaches one farther than the blur
         self.margin = self.reach + self.is_resized
         down, across = (self._axis(size[k], labels.shape[k - 2], device) for k in (0, 1))
         self._tables_per_axis = len(down)
@@ -47,7 +47,7 @@ class MapWindows:
     def _soft_tables(
         self, maps: Tensor, table: MapTable, size: tuple[int, int]
     ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-        """Return what is read of pixels beside their labels; and widths of contours, their blurs, and the ratio."""
+        """Return the images that are read beside the labels; and squared widths of contours, taps, and ratios."""
         widths = torch.zeros(1, dtype=torch.float64, device=maps.device)
         width_index = torch.zeros_like(maps)
         if table.blurs is not None:
@@ -60,7 +60,7 @@ class MapWindows:
         sides = [torch.full((), n, dtype=torch.float64, device=maps.device) for n in (*maps.shape[-2:], *size)]
         ratio = torch.stack([sides[2] / sides[0], sides[3] / sides[1]])
         if self.is_resized:
-            is_native = (ratio == 1).all()  # which a graph of any size may be
+            is_native = (ratio == 1).all()  # a graph for any size may run at the map's own
             is_sharp = widths.index_select(0, width_index.flatten()).reshape(maps.shape) < LEAST_BLUR
             weight, other, other_weight = antialias(maps, is_sharp)
             blurs = torch.where(is_native, widths, widths.clamp_min(LEAST_BLUR))
@@ -70,13 +70,13 @@ class MapWindows:
         return images, (widths.square(), taps, ratio)
 
     def _axis(self, new: int, length: int, device: torch.device) -> tuple[Tensor, ...]:
-        """Return the lines of the windows of tiles, and a matrix of interpolation for each where resized."""
+        """Return the lines of each tile's window, and, if the map is resized, its matrix of interpolation."""
         count = (new + self.side - 1) // self.side
         if not self.is_resized:
             return self._lines(torch.arange(count, device=device) * self.side, self.side, length)
         # the last pixel is repeated past the edge
         pixels = torch.arange(count * self.side, device=device).clamp_max(new - 1)
-        # between which pixels of the map each pixel lies, and how far
+        # place of each pixel among the pixels of the map
         place = ((2 * pixels + 1).double() * length - new) / (2 * new)
         low = place.floor().reshape(count, -1, 1)
         weight = (place.reshape(count, -1, 1) - low).to(self.dtype)
@@ -87,15 +87,15 @@ class MapWindows:
         return (*self._lines(first, span, length), before * (1 - weight) + after * weight)
 
     def _lines(self, first: Tensor, span: int, length: int) -> tuple[Tensor, Tensor]:
-        """Return the rows or columns of windows of `span` pixels with a halo, clamped, and which are in the image."""
+        """Return the clamped rows or columns of windows of `span` pixels with a halo, and which are in the image."""
         lines = torch.arange(span + 2 * self.margin, device=first.device) - self.margin
         lines = first[:, None] + lines
         return lines.clamp(0, length - 1), ((lines >= 0) & (lines < length)).to(self.dtype)
 
-    # Inside a loop, which hands in the tables
+    # the methods below run inside a loop, which hands in the tables
 
     def read_tile(self, tables: Sequence[Tensor], image: Tensor, row: Tensor, column: Tensor) -> tuple[Tensor, ...]:
-        """Read the window of tile (row, column) of an image: its labels, sorted, and what `membership` takes."""
+        """Read the window of tile (row, column) of an image: its sorted labels, then the operands of `membership`."""
         maps, height, width = tables[0].unbind()
         first_row = image % maps * height
         end = 1 + 2 * self._tables_per_axis
@@ -130,9 +130,9 @@ class MapWindows:
         return ids, *operands, *images, down[2], across[2], exponent
 
     def membership(self, operands: Sequence[Tensor], region: Tensor) -> Tensor:
-        """Evaluate the membership of a tile's pixels in a region, (1,); `operands` are what `read_tile` found.
+        """Evaluate the membership of a tile's pixels in a region, (1,); `operands` come from `read_tile`.
 
-        Of a map at another size they are to be divided by their sum over the regions.
+        If the map is resized, the caller divides memberships by their sum over the regions.
         """
         window, *soft = operands
         inside = (window == region).to(self.dtype)
@@ -151,7 +151,7 @@ class MapWindows:
         return window[margin : window.shape[0] - margin, margin : window.shape[1] - margin]
 
     def _blur(self, inside: Tensor, blurs: Tensor, rows_inside: Tensor, columns_inside: Tensor) -> Tensor:
-        """Blur a window by one kernel, (1, 2 R + 1), or by one for each pixel inside of its halo of R."""
+        """Blur a window by one kernel, (1, 2 R + 1), or by a kernel for each pixel inside of its halo of R."""
         taps = 2 * self.reach + 1
         height, width = (n - taps + 1 for n in inside.shape)
         steps = torch.arange(taps, device=inside.device)
@@ -160,7 +160,7 @@ class MapWindows:
         near_rows = rows_inside.index_select(0, rows).reshape(height, 1, taps)
         near_columns = columns_inside.index_select(0, columns).reshape(width, taps)
         total = (kernels * near_rows).sum(-1) * (kernels * near_columns).sum(-1)
-        # along rows, those of the halo too; then along columns
+        # along rows, including rows of the halo; then along columns
         blurred = inside.T.index_select(0, columns).reshape(width, taps, -1)
         blurred = kernels.permute(1, 0, 2) @ blurred  # [width, height, height + 2 R]
         blurred = blurred.gather(2, rows.reshape(1, height, taps).expand(width, height, taps))

@@ -10,11 +10,11 @@ from kcgs._labels import check_labels
 
 from .contour_fit import check_problem, contour_gain
 
-# Squared error, mean over channels, that a pixel of contour must save: what its bits save where Gaussians spend them.
+# squared error, mean over channels, that a pixel of contour must save: what Gaussians would save with its bits
 MERGE_COST = 0.003
-_MIN_SHARE = 0.1  # of the error that three quarters of a contour must save: its colours then differ along most of it
+_MIN_SHARE = 0.1  # share of the error that three in four windows must save: colours then differ along most of a contour
 _BAND = 12.0  # pixels across a contour over which its error counts: windows reach 6 to each side
-_ROUNDS = 8  # of merging and judging again, at most
+_ROUNDS = 8  # most rounds of merging and judging again
 
 
 def merge_regions(
@@ -22,11 +22,11 @@ def merge_regions(
 ) -> Tensor:
     """Merge regions whose contour saves less error than Gaussians would save with its bits.
 
-    Convention: what a contour saves is predicted from the pixels near it: how much better two linear colours, mixed
-    across the contour, explain them than one quadratic colour. The default cost is that of one to two bits per pixel of
-    contour; as lossless WebP the maps of `auto` take 3.5 bits, and lose to Gaussians of as many bytes. A contour that
-    saves less than a tenth of the error in a quarter of its windows, as one across texture, saves nothing. The contours
-    that save least go first, and the new map is judged again, eight times at most.
+    Convention: what a contour saves is predicted from the pixels near it: the error of one quadratic colour less the
+    error of two linear colours mixed across the contour. The default is the cost of one to two bits per pixel of
+    contour; as lossless WebP the maps of `auto` take 3.5 bits, and Gaussians of as many bytes save more. A contour that
+    saves less than a tenth of the error in a quarter of its windows counts as saving nothing, as contours across
+    texture do. Contours that save least are merged first, and the new map is judged again, eight times at most.
 
     Args:
         image: :math:`(C, H, W)` floating in [0, 1].

@@ -1,4 +1,4 @@
-"""How far an image is from another: the metrics, and the list of them that `evaluate` and the reports follow."""
+"""The metrics between an image and its target, and the list of them that `evaluate` and the reports follow."""
 
 from __future__ import annotations
 
@@ -18,15 +18,16 @@ from kcgs.maps import edge_band
 
 from .similarity import SCALE_WEIGHTS, SSIM_WINDOW, mean_ssim
 
-# of MS-SSIM; the coarsest of its scales holds one window
+# least side for MS-SSIM, whose coarsest scale then holds one window
 _MS_SSIM_SIDE = (SSIM_WINDOW - 1) * 2 ** (len(SCALE_WEIGHTS) - 1) + 1  # pixels
 
 
 def psnr(image: Tensor, target: Tensor) -> Tensor:
     r"""Peak signal-to-noise ratio: :math:`-10 \log_{10}` of the mean squared error over pixels and channels.
 
-    Convention, of all metrics: both are clipped to [0, 1], data range 1; one number per image. Half precision is
-    computed and returned in float32; two dtypes meet in the wider one. Differentiable, except between identical images.
+    Convention, of all metrics: both images are clipped to [0, 1], the data range is 1; one number per image. Half
+    precision is computed and returned in float32; of two dtypes the wider counts. Differentiable, except between
+    identical images.
 
     Args:
         image: floating, :math:`(C, H, W)` or :math:`(B, C, H, W)`, any number of channels.
@@ -51,9 +52,10 @@ def psnr(image: Tensor, target: Tensor) -> Tensor:
 def ssim(image: Tensor, target: Tensor) -> Tensor:
     r"""Structural similarity: 11 x 11 Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03.
 
-    Convention: arguments, range and errors are those of :func:`psnr`; the mean over channels and over the positions
-    where the window lies inside the image, without padding. Differentiable. Sums, not convolutions: variances are small
-    differences, and the TF32 of CUDA's convolutions has too few digits for them (errors up to 0.03 on photographs).
+    Convention: arguments, range and errors are those of :func:`psnr`. The result is the mean over channels and over the
+    positions where the window lies inside the image, without padding. Differentiable. Windows are sums, not
+    convolutions: variances are small differences, and the TF32 of CUDA's convolutions has too few digits for them
+    (errors up to 0.03 on photographs).
 
     Returns:
         In [-1, 1], 0-dim or :math:`(B)`. NaN, with a RuntimeWarning, where a side is below 11 pixels.
@@ -75,11 +77,11 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
 def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
     r"""Multi-scale structural similarity over 5 scales with the published weights.
 
-    Convention: arguments, range and errors are those of :func:`psnr`, the window that of :func:`ssim`, without padding;
-    channels apart, then averaged. A scale whose mean term is below zero counts as zero, since a fractional power of it
-    does not exist; the gradient is not finite there. Between scales 2 x 2 pixels are averaged, and a last row or column
-    without a partner with itself, as in the authors' program. pytorch-msssim pairs the first and last with black: the
-    same where every halved side is even, else up to 0.004 away (measured at 201 x 333).
+    Convention: arguments, range and errors are those of :func:`psnr`, the window is that of :func:`ssim`, without
+    padding. The result is the mean over channels. A scale whose mean term is below zero counts as zero, since a
+    fractional power of it does not exist; the gradient is not finite there. Between scales, blocks of 2 x 2 pixels are
+    averaged; an odd last row or column is repeated, as in the authors' program. pytorch-msssim pads odd sides with
+    black: results are equal where every halved side is even, and else differ by up to 0.004 (measured at 201 x 333).
 
     Returns:
         In [0, 1], 0-dim or :math:`(B)`. NaN, with a RuntimeWarning, where a side is below 161 pixels.
@@ -139,8 +141,8 @@ def ef_psnr(image: Tensor, target: Tensor, labels: Tensor, width: float = 5) -> 
 def ef_ssim(image: Tensor, target: Tensor, labels: Tensor, width: float = 5) -> Tensor:
     r"""Edge-focused SSIM: the mean of the SSIM map over the band along the contours only.
 
-    Convention: arguments, band and errors are those of :func:`ef_psnr`, the window that of :func:`ssim`, and the map as
-    large as the image, which is mirrored at its border for that (border pixel not repeated).
+    Convention: arguments, band and errors are those of :func:`ef_psnr`, the window is that of :func:`ssim`. Images are
+    mirrored at their border (border pixel not repeated), so that the map is as large as the image.
 
     Returns:
         In [-1, 1], 0-dim or :math:`(B)`. NaN, with a RuntimeWarning, where a side is below 11 pixels or the label map
@@ -166,12 +168,12 @@ def ssimulacra2(image: Tensor, target: Tensor) -> Tensor:
     r"""SSIMULACRA2 of the 8-bit values: how people judge an image that was compressed.
 
     Convention: arguments, range and errors are those of :func:`psnr`, and `target` is the original. Equal images have
-    100, images that look equal 90, high, medium and low quality 70, 50 and 30; it may be negative. Below 225 pixels
-    per side it has fewer scales: compare only with images of that size. Not differentiable; about 0.3 s for 480 x 854.
+    100, images that look equal 90, high, medium and low quality 70, 50 and 30; scores may be negative. Below 225 pixels
+    per side it has fewer scales: compare only images of one size. Not differentiable; about 0.3 s for 480 x 854.
 
     Returns:
-        float64, on the CPU, 0-dim or :math:`(B)`. NaN, without a warning, where the package is missing, which `pip
-        install ssimulacra2` brings, a side is below 8 pixels, or the channels are neither grey nor RGB.
+        float64, on the CPU, 0-dim or :math:`(B)`. NaN, without a warning, where the package is missing
+        (`pip install ssimulacra2`), a side is below 8 pixels, or the channels are neither grey nor RGB.
 
     Example:
         >>> ssimulacra2(torch.zeros(3, 7, 9), torch.zeros(3, 7, 9))
@@ -195,11 +197,11 @@ class Metric(NamedTuple):
     """A row of `METRICS`."""
 
     function: Callable[..., Tensor]
-    """Of an image and a target, and of labels where `takes_labels`; as `psnr` and `ef_psnr` are."""
+    """Takes an image and a target, as `psnr` does; with `takes_labels` also labels, as `ef_psnr` does."""
     undefined: str = ""
-    """When it is NaN."""
+    """When the metric is NaN."""
     takes_labels: bool = False
-    """Whether it is taken along contours."""
+    """Whether the metric is taken along contours."""
 
 
 # what `evaluate` and the command line report, in this order

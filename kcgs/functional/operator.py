@@ -1,7 +1,7 @@
 """`kcgs::region_splat`, the operator that torch's tools see: its schema, derivatives, shapes and vmap.
 
-All enters as tensors and numbers; `evaluation` computes. What a forward has prepared is kept for its backward on
-autograd's context, which neither compilers nor transforms see: they prepare again.
+Its arguments are tensors and numbers; `evaluation` computes. A forward keeps its plan for its backward on autograd's
+context. Compilers and transforms do not see the context: their backward plans again.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from kcgs.maps import PER_MAP, SHARED, MapTable
 from .arguments import NUM_ARGUMENTS, SCHEMA, SplatArguments, place_of
 from .evaluation import Evaluation, differentiate, differentiate_forward, differentiate_twice, prepare, render
 
-# arguments that are not differentiated by
+# number of arguments without a derivative
 _NUM_CONSTANTS = NUM_ARGUMENTS - 3
 _BACKWARD = f"Tensor grad, {SCHEMA}, bool geometry"
 _TANGENTS = "Tensor d_means, Tensor d_cholesky, Tensor d_colors"
@@ -40,18 +40,18 @@ _LIBRARY.define(f"region_splat_forward({_TANGENTS}, {SCHEMA}) -> Tensor")
 
 _THIRD = "region_splat is differentiable twice: take vhp of torch.autograd.functional, not hvp, which needs a third"
 
-# as Python calls them
+# the operators, as Python calls them
 splat_operator: Any = torch.ops.kcgs.region_splat.default
 _backward_operator: Any = torch.ops.kcgs.region_splat_backward.default
 _double_backward_operator: Any = torch.ops.kcgs.region_splat_double_backward.default
 _forward_operator: Any = torch.ops.kcgs.region_splat_forward.default
 
 
-# Derivatives: what runs first where a gradient may be needed
+# Derivatives: these functions run first where a gradient may be needed
 
 
 def _differentiable(operator: Any, function: Any, num_tensors: int, *arguments: Any) -> Any:
-    """Evaluate an operator by its autograd.Function where the first tensors need a derivative, else below autograd."""
+    """Evaluate an operator by its autograd.Function if the first tensors need a derivative, else below autograd."""
     if _is_differentiated(arguments[:num_tensors]):
         return apply(function, *arguments)
     return below_autograd(operator, *arguments)
@@ -61,7 +61,7 @@ class _Splat(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> Tensor:
         image: Tensor
-        if _is_plain(arguments[:3]):  # what is prepared stays on this side of the operator
+        if _is_plain(arguments[:3]):  # the plan cannot pass through the operator
             image, ctx.evaluation = below_autograd(_render, SplatArguments.of(*arguments))
         else:
             image, ctx.evaluation = _unrecorded(splat_operator, *arguments), None
@@ -86,7 +86,7 @@ class _Splat(torch.autograd.Function):
         else:
             gradients = _backward_operator(grad, *gaussians, *_constants(ctx), geometry)
         if not is_graph_retained():
-            ctx.evaluation = None  # as torch frees what is saved: a loss that stays alive holds none
+            ctx.evaluation = None  # torch frees saved tensors at this time: a loss that stays alive holds no plan
         needed = zip(gradients, (means, cholesky, colors), strict=True)
         return (*(g if need else None for g, need in needed), *[None] * _NUM_CONSTANTS)
 
@@ -156,7 +156,7 @@ def _keep_constants(ctx: Any, constants: tuple[Any, ...]) -> None:
 
 
 def _constants(ctx: Any) -> tuple[Any, ...]:
-    """Return what was kept; refuse ids and labels that were written to since, as torch does for what it saves."""
+    """Return the constants; raise if ids or labels were written to since, as torch does for saved tensors."""
     constants: tuple[Any, ...] = ctx.constants
     for name, version, expected in zip(("region_ids", "regions"), _versions(constants), ctx.versions, strict=True):
         if version != expected:
@@ -168,7 +168,7 @@ def _constants(ctx: Any) -> tuple[Any, ...]:
 
 
 def _versions(constants: tuple[Any, ...]) -> list[int | None]:
-    """Return how often ids and labels have been written to; None: nobody counts."""
+    """Return how often ids and labels have been written to; None: torch does not count."""
     return [None if t is None or t.is_inference() else t._version for t in constants[:2]]
 
 
@@ -181,7 +181,7 @@ def _is_differentiated(tensors: tuple[Tensor, ...]) -> bool:
 
 
 def _is_plain(tensors: tuple[Tensor, ...]) -> bool:
-    """True where no transform, mode or subclass of torch has to see the operator."""
+    """Return whether no transform, mode or subclass of torch has to see the operator."""
     if is_transforming() or has_mode():
         return False
     return all(
@@ -265,9 +265,9 @@ def _backward_vmap(
 
 
 def _fold(info: Any, in_dims: tuple[int | None, ...], arguments: tuple[Any, ...], first: int) -> tuple[bool, list[Any]]:
-    """Put the mapped dimension of every tensor into its batch; `first` is the place of the means.
+    """Fold the mapped dimension of every tensor into its batch; `first` is the place of the means.
 
-    Returns, first, whether there was a batch.
+    Returns whether there was a batch, and the arguments.
     """
     places = {name: first + place_of(name) for name in MapTable._fields}
     labels = places["labels"]
@@ -295,12 +295,12 @@ def _fold(info: Any, in_dims: tuple[int | None, ...], arguments: tuple[Any, ...]
             return part.expand(-1, count, -1, -1).flatten(0, 1)
 
         for name, k in places.items():
-            if name not in SHARED:  # the others number the maps otherwise, and are made anew
+            if name not in SHARED:  # the other fields depend on the number of maps, and are made anew
                 folded[k] = each(k) if name in PER_MAP and arguments[k] is not None else None
     return batched, folded
 
 
-# the last is the number of tensors at the beginning of the arguments that it is differentiated by
+# the last column is the number of first arguments by which an operator is differentiated
 for _name, _evaluate, _shape, _function, _num_tensors in (
     ("region_splat", _splat, _splat_shape, _Splat, 3),
     ("region_splat_backward", _splat_backward, _backward_shapes, _SplatBackward, 4),

@@ -19,7 +19,7 @@ _BLOCK = 1 << 18  # pixels that are compared at a time: they stay in a processor
 
 
 def mean_ssim(image: Tensor, target: Tensor, *, contrast: bool = False, band: Tensor | None = None) -> Tensor:
-    """Mean SSIM of each channel, or contrast and structure alone, where the window lies inside, or over a band.
+    """Average SSIM, or contrast and structure alone, per channel, where the window lies inside, or over a band.
 
     Returns:
         (B, C) float64.
@@ -30,7 +30,7 @@ def mean_ssim(image: Tensor, target: Tensor, *, contrast: bool = False, band: Te
         pixels = band.sum((1, 2, 3))[:, None]
         image, target = (pad(t, [_MARGIN] * 4, mode="reflect") for t in (image, target))
         band = band.expand(batch, channels, -1, -1).flatten(0, 1)
-    # compiled, a loop over blocks would be a graph of thousands of nodes
+    # in a compiled graph, a loop over blocks would be thousands of nodes
     whole = torch.compiler.is_compiling()
     planes = batch * channels if whole else max(1, _BLOCK // (height * width))
     rows = image.shape[-2] if whole else max(8 * _MARGIN, _BLOCK // width)
@@ -45,7 +45,7 @@ def _sum_ssim(image: Tensor, target: Tensor, band: Tensor | None, contrast: bool
     total = image.new_zeros(len(image), dtype=torch.float64)
     top, overhang = 0, image.new_empty((2, len(image), 0, image.shape[-1]))
     for block in zip(image.split(rows, -2), target.split(rows, -2), strict=True):
-        # `split` and `cat`, since the gradient of overlapping slices would be as large as the image for each
+        # `split` and `cat`, since the gradient of each overlapping slice would be as large as the image
         window = torch.cat([overhang, torch.stack(block)], -2)
         values = _similarity(window[0], window[1], contrast)
         overhang, bottom = window[..., -2 * _MARGIN :, :], top + values.shape[-2]
@@ -55,7 +55,7 @@ def _sum_ssim(image: Tensor, target: Tensor, band: Tensor | None, contrast: bool
 
 
 def _similarity(image: Tensor, target: Tensor, contrast: bool) -> Tensor:
-    """SSIM, or its contrast and structure alone, where the window lies inside."""
+    """Return SSIM, or its contrast and structure alone, where the window lies inside."""
     moments = window_mean(torch.stack([image, target, image * image, target * target, image * target]))
     squares, product = (moments[:2] * moments[:2]), moments[0] * moments[1]
     variances = (moments[2:4] - squares).clamp_min(0.0).sum(0)

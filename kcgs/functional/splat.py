@@ -35,21 +35,21 @@ def region_splat(
 
     Convention: points are (x, y) in pixels and pixel (j, i) is sampled at (j + 0.5, i + 0.5); a Gaussian whose id the
     map does not hold paints nothing; N = 0 gives a black image. Half precision is computed in float32. The result is
-    not clamped. Once differentiable in means, cholesky and colors, backward; with backend "reference" twice, once of
-    which may be forward. It is the operator ``torch.ops.kcgs.region_splat``: one node of a graph of `torch.compile` and
-    `torch.export`, and `torch.func` transforms it, `vmap` by a larger batch.
+    not clamped. It is differentiable in means, cholesky and colors: once, by backward; with backend "reference" twice,
+    of which one may be forward. It is the operator ``torch.ops.kcgs.region_splat``: one node in graphs of
+    `torch.compile` and `torch.export`. `torch.func` transforms it; `vmap` makes the batch larger.
 
     Args:
-        means: centres in pixels, within 1e8, :math:`(B, N, 2)`, or all without B.
+        means: centres in pixels, within 1e8, :math:`(B, N, 2)`; for one image, all tensors may come without B.
         cholesky: factors (l11, l21, l22) of the covariances in pixels, l11 and l22 in [1e-6, 1e8],
             :math:`(B, N, 3)`.
         colors: any range, opacity merged, :math:`(B, N, C)`, C at least 1.
         region_ids: integer region of each Gaussian, :math:`(B, N)`; needed where `regions` is given, and None without.
         regions: a RegionMap, or labels, :math:`(H, W)` or :math:`(B, H, W)`, whose contours are hard; None: one region.
-        size: (height, width); needed without `regions`, else it must equal theirs.
-        cutoff: weights below it are skipped, in [0, 1), and cpu interpolates wide Gaussians between coarse nodes as
-            closely; 0 evaluates all at all pixels. Skipping a Gaussian is off by cutoff times its absolute colour at
-            most, interpolating by 3.2 times that: see docs/performance.md.
+        size: (height, width); needed without `regions`, else it must equal the size of `regions`.
+        cutoff: weights below it are skipped, in [0, 1), and backend cpu interpolates wide Gaussians between coarse
+            nodes. A skipped Gaussian is off by at most cutoff times its absolute colour, an interpolated one by 3.2
+            times that, see docs/performance.md. 0 evaluates all Gaussians at all pixels.
         backend: auto, reference, tiled, cpu or cuda.
 
     Returns:
@@ -98,7 +98,7 @@ def splat_at(
     cutoff: float,
     backend: str,
 ) -> Tensor:
-    """Render at a size, at which the map is sampled, as by :meth:`RegionMap.resize`; ids and map come together."""
+    """Render at a size; the map is sampled as by :meth:`RegionMap.resize`; ids and map come together."""
     _check_gaussians(means, cholesky, colors)
     if table is not None:
         region_ids = check_ids("region_ids", region_ids, means, values=False)

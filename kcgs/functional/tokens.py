@@ -48,6 +48,6 @@ def from_tokens(tokens: Tensor, size: tuple[int, int] | Tensor) -> tuple[Tensor,
 
 
 def _extent(table: Tensor, size: tuple[int, int] | Tensor) -> tuple[Tensor, Tensor]:
-    """Return (width, height) and the root of the area, in the shapes of tables (..., N, K) and of their columns."""
+    """Return (width, height) and the root of the area, which broadcast to tables (..., N, K) and to their columns."""
     sizes = torch.as_tensor(size, dtype=table.dtype, device=table.device).unsqueeze(-2)
     return sizes.flip(-1), sizes.prod(-1).sqrt()
