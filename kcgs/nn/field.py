@@ -30,8 +30,8 @@ class GaussianField(nn.Module):
     r"""Gaussians of an image, or of a batch of images, with the region that each may paint.
 
     Convention: an `nn.Parameter` is registered as it is; another tensor that requires a gradient (say, the output of a
-    network) stays in its graph, as a buffer; a copy of any other becomes a parameter. Half precision cannot hold a
-    pixel position, so `.half()` and `.bfloat16()` leave the field in float32 and warn.
+    network) stays in its graph, as a buffer; of any other tensor a copy becomes a parameter. Half precision cannot hold
+    a pixel position, so `.half()` and `.bfloat16()` leave the field in float32 and warn.
 
     Args:
         means: centres (x, y) in pixels, :math:`(N, 2)` or :math:`(B, N, 2)`.
@@ -121,13 +121,13 @@ class GaussianField(nn.Module):
         seed: int | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> GaussianField:
-        """Sample centres uniformly over the image, round Gaussians, uniform colours that add up to about grey.
+        """Sample round Gaussians: centres uniform over the image, and uniform colours that add up to about grey.
 
         Args:
             num_gaussians: N, at least 0.
             size: (height, width) in pixels.
             channels: C, at least 1.
-            sigma: standard deviation in pixels; None: half the side of the area that each Gaussian serves.
+            sigma: standard deviation in pixels; None: half the root of the area per Gaussian, at least 0.5.
             regions: assign each Gaussian the region under its centre.
             seed: of the samples; None: torch's global generator.
             dtype: float32 or float64.
@@ -144,7 +144,7 @@ class GaussianField(nn.Module):
         generator = None if seed is None else torch.Generator().manual_seed(seed)
         means = torch.rand(num_gaussians, 2, generator=generator, dtype=dtype) * torch.tensor([width, height])
         cholesky = torch.tensor([sigma, 0.0, sigma], dtype=dtype).repeat(num_gaussians, 1)
-        # a Gaussian weighs 2 pi sigma^2 pixels: by this factor the mean of the image is near the mean colour
+        # a Gaussian's weights sum to 2 pi sigma^2 pixels: `overlap` is the mean sum of weights at a pixel
         overlap = max(1.0, 2 * torch.pi * sigma**2 * num_gaussians / (height * width))
         colors = torch.rand(num_gaussians, channels, generator=generator, dtype=dtype) / overlap
         field = cls(means.to(dtype), cholesky, colors, size=size)
@@ -154,7 +154,7 @@ class GaussianField(nn.Module):
         """Give every Gaussian the region under its centre, in place, and return the field.
 
         Args:
-            regions: label map of the field's size, or a RegionMap of one.
+            regions: label map or RegionMap of the field's size.
         """
         labels = regions.labels if isinstance(regions, RegionMap) else check_labels("regions", regions)
         ids = lookup_regions(self.means, labels)
@@ -218,7 +218,7 @@ class GaussianField(nn.Module):
 
         Raises:
             TypeError: not GaussianFields.
-            ValueError: no fields, batched ones, or fields that differ.
+            ValueError: no fields, batched fields, or fields that differ.
 
         Example:
             >>> batch = GaussianField.stack([GaussianField.random(9, (8, 8), seed=seed) for seed in range(4)])
@@ -303,7 +303,7 @@ class GaussianField(nn.Module):
         return GaussianField(means, self.cholesky, self.colors, self.region_ids, self.opacities, size=self.size)
 
     def _mirrored(self, axis: int) -> GaussianField:
-        """Mirror x (0) or y (1): a covariance keeps its variances, and the sign of its covariance changes."""
+        """Mirror x (0) or y (1): the variances stay, and the covariance of x and y changes its sign."""
         signs, offsets = self.means.new_ones(2), self.means.new_zeros(2)
         signs[axis], offsets[axis] = -1.0, self.size[1 - axis]
         cholesky = self.cholesky * self.cholesky.new_tensor([1.0, -1.0, 1.0])
@@ -311,15 +311,15 @@ class GaussianField(nn.Module):
         return GaussianField(means, cholesky, self.colors, self.region_ids, self.opacities, size=self.size)
 
     def merged_colors(self) -> Tensor:
-        """Colours with the opacities multiplied in, (N, C) or (B, N, C)."""
+        """Return the colours with the opacities multiplied in, (N, C) or (B, N, C)."""
         return self.colors if self.opacities is None else self.colors * self.opacities[..., None]
 
     def get_extra_state(self) -> dict[str, tuple[int, int]]:
-        """Size, for `state_dict`."""
+        """Return the size, for `state_dict`."""
         return {"size": self.size}
 
     def set_extra_state(self, state: dict[str, tuple[int, int]]) -> None:
-        """Size, from `load_state_dict`."""
+        """Set the size, from `load_state_dict`."""
         self.size = check_size("size", tuple(state["size"]))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:

@@ -27,7 +27,7 @@ class RegionSplatRenderer(nn.Module):
     r"""Render a field, at its own size or any other.
 
     Convention: at another size the Gaussians are scaled and the label map is sampled again. A smaller image is the
-    area mean of the one at the field's size. The module holds no state.
+    area mean of the image at the field's size. The module holds no state.
 
     Args:
         cutoff: weights below it are skipped, in [0, 1); see :func:`kcgs.functional.region_splat`.
@@ -68,7 +68,7 @@ class RegionSplatRenderer(nn.Module):
         Args:
             field: the Gaussians; or a :class:`kcgs.Scene`, which brings its map along, so that the renderer can be the
                 first link of an `nn.Sequential`.
-            regions: label map of the field's size or of `size`; None: the scene's, or none, where the field has no ids.
+            regions: label map of the field's size or of `size`; None: the scene's map; a field without ids needs none.
             size: (height, width) of the image; None: the field's.
 
         Returns:
@@ -82,7 +82,7 @@ class RegionSplatRenderer(nn.Module):
             UserWarning: Gaussians whose region ids the map does not hold; they paint nothing.
         """
         if not isinstance(field, GaussianField):
-            # not by isinstance of the protocol, which takes as long as the rest of this module
+            # isinstance(field, SceneLike) would take as long as the rest of this module
             if not isinstance(getattr(field, "field", None), GaussianField):
                 raise TypeError(f"field must be a GaussianField or a Scene; got {type(field).__name__}")
             regions = field.regions if regions is None else regions
@@ -99,7 +99,7 @@ class RegionSplatRenderer(nn.Module):
         if map_size not in (field.size, size):
             other = "" if size == field.size else f" or {size}"
             raise ValueError(f"regions must have the size {field.size} of the field{other}; got {map_size}")
-        # a map of the image's size does not say what there is between its pixels
+        # a map of the image's size cannot be sampled between its pixels: no larger render is averaged
         resized = table is not None and map_size != field.size
         fine = size if resized else rendered_size(field.size, size)
         means, cholesky = scaled_gaussians(field, fine)
@@ -123,12 +123,13 @@ def rendered_size(field_size: tuple[int, int], size: tuple[int, int]) -> tuple[i
 
 
 def _larger(a: int, b: int) -> int:
-    # torch.export traces sizes that are no int, which max would fix; torch.compile of torch 2.11 lacks sym_max of int
+    # torch.export traces sizes that are no int, and max would make them constants; torch.compile of torch 2.11 lacks
+    # sym_max of int
     return max(a, b) if isinstance(a, int) and isinstance(b, int) else torch.sym_max(a, b)
 
 
 def area_mean(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """Shrink an image, (..., H, W): each pixel is the mean over its share of the height and width, fractions included.
+    """Shrink an image, (..., H, W): a pixel is the mean over its share of the height and width, fractions included.
 
     Example:
         >>> area_mean(torch.tensor([[0.0, 3.0, 6.0]]), (1, 2))
@@ -142,13 +143,13 @@ def _shrink(image: Tensor, dim: int, size: int) -> Tensor:
     length = image.shape[dim]
     if is_equal(size, length):
         return image
-    begin = torch.arange(size, device=image.device) * length  # in units of 1 / (size * length) of the whole
+    begin = torch.arange(size, device=image.device) * length  # in units of 1 / (size * length) of the whole side
 
     def share(line: Tensor) -> Tensor:
         overlap = torch.minimum(begin + length, (line + 1) * size) - torch.maximum(begin, line * size)
         return overlap.clamp_min(0).to(image.dtype) / length
 
-    if not torch.compiler.is_compiling():  # many times as fast as a matrix, which a graph of any size takes
+    if not torch.compiler.is_compiling():  # many times as fast as the matrix of a graph for any size
         total = torch.zeros_like(image.narrow(dim, 0, size))
         for step in range(length // size + 2 * (length % size > 0)):
             line = begin // size + step

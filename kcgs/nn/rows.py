@@ -17,13 +17,13 @@ def scaled_gaussians(field: GaussianField, size: tuple[int, int]) -> tuple[Tenso
     means, cholesky = field.means, field.cholesky
     if is_equal(size[0], field.size[0]) and is_equal(size[1], field.size[1]):
         return means, cholesky
-    # a graph of any size takes its sides as tensors only
+    # a graph for any size needs the sides as tensors
     factors = torch.stack([torch.full((), size[k], dtype=torch.float64) / field.size[k] for k in (1, 0)]).to(means)
     return means * factors, cholesky * factors[[0, 1, 1]]
 
 
 def join(first: GaussianField, second: GaussianField) -> GaussianField:
-    """Put two fields, both with region ids or neither, into one without the graph; no opacity is 1."""
+    """Join two fields, both with region ids or neither, without the graph; missing opacities count as 1."""
     rows = first.means.ndim - 2
 
     def concatenate(a: Tensor, b: Tensor) -> Tensor:
@@ -40,10 +40,10 @@ def join(first: GaussianField, second: GaussianField) -> GaussianField:
 
 
 def pad_rows(field: GaussianField, count: int, regions: RegionMap | None = None) -> GaussianField:
-    """Return a field without opacities with rows of the colour 0 up to a number for each image, and without the graph.
+    """Pad a field without opacities with black Gaussians to `count` per image, without the graph.
 
-    The rows are of the region of an image's first Gaussian, or with a map of its first region; with a map all Gaussians
-    of a field without ids are, too.
+    The new Gaussians have the region of the image's first Gaussian or, with a map, the map's first region. With a map,
+    all Gaussians of a field without ids get the map's first region.
     """
     missing, ids = count - field.num_gaussians, field.region_ids
     means, cholesky, colors = (
