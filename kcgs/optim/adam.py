@@ -1,4 +1,4 @@
-"""The step of Adam in each Gaussian's own frame: by compiled loops, by a program of a GPU, or by torch operations."""
+"""The step of Adam in each Gaussian's own frame: by compiled loops, by a Triton program, or by torch operations."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from kcgs.kernels import takes_triton
 from .frame import local_gradient, move, widen
 from .settings import Adam, Bounds
 
-# rows of geometry that one task moves, at least, and for which another thread is woken
+# least rows of geometry per task, and rows for which another thread is woken
 _TASK_ROWS = 512
 _THREAD_ROWS = 2048
 # pixels: factors are at least this before they are widened, so that their squares are far from underflow
 _MIN_FACTOR = 0.1
-# age of a row that does not move; loops and programs take every negative one as such
+# age of a frozen row; loops and programs take every row of negative age as frozen
 FROZEN = -1.0
 # standard deviations by which a centre may lie outside the image, where fields are not bounded
 _MAX_OUTSIDE = 2.0
@@ -51,7 +51,7 @@ def step_groups(state: dict[Tensor, Any], geometry: dict[str, Any], colors: dict
 
 def _step_colors(state: dict[str, Tensor], group: dict[str, Any], finite: Tensor | None) -> None:
     colors, *opacities = group["params"]
-    # the steps of a frozen table go into a copy of it
+    # a copy of a frozen table takes its steps
     tables = [table if table.requires_grad else table.clone() for table in (colors, *opacities)]
     tables = [tables[0], *(alpha[..., None] for alpha in tables[1:])]
     gradients = [_gradient(colors), *(_gradient(alpha)[..., None] for alpha in opacities)]
@@ -88,7 +88,7 @@ def _step_geometry(state: dict[str, Tensor], group: dict[str, Any], finite: Tens
     step = step.clamp(-group["max_step"], group["max_step"])
     moved = within_bounds(*move(means, cholesky, step), bounds_of(group))
     for parameter, values in zip((means, cholesky), moved, strict=True):
-        if parameter.requires_grad:  # a frozen one is not even brought within bounds
+        if parameter.requires_grad:  # a frozen parameter is not even brought within bounds
             _write(parameter, values, moving)
 
 
@@ -100,7 +100,7 @@ def _launch(state: dict[Tensor, Any], geometry: dict[str, Any], colors: dict[str
     for group in (geometry, colors):
         moves, averages = _has_gradient(group), state[group["params"][0]].values()
         gradients += [_gradient(p).contiguous() if moves and p.requires_grad else None for p in group["params"]]
-        # where nothing moves any address will do: it is not read
+        # a group that does not move passes any address: it is not read
         adams.append(Adam(*_settings(group), *(averages if moves else group["params"][:1] * 3)))
     parameters = geometry["params"] + colors["params"]
     cuda.step(parameters, gradients, adams[0], adams[1], bounds_of(geometry))
@@ -120,12 +120,12 @@ def _has_gradient(group: dict[str, Any]) -> bool:
 
 
 def _checks_gradients(parameter: Tensor) -> bool:
-    """True where gradients that are not finite are an error: reading values of a device would wait for it."""
+    """Return whether gradients that are not finite are an error: only on the CPU, where a check does not wait."""
     return parameter.is_cpu
 
 
 def _is_compiled(*tensors: Tensor) -> bool:
-    """True where compiled loops may read and change the memory of tensors."""
+    """Return whether compiled loops may read and change the memory of tensors."""
     return not torch.compiler.is_compiling() and all(
         t.dtype is torch.float32 and t.is_cpu and t.is_contiguous() for t in tensors
     )
@@ -137,7 +137,7 @@ def _rows(*tensors: Tensor) -> list[Any]:
 
 
 def _settings(group: dict[str, Any]) -> list[Any]:
-    """Return learning rate, betas and eps as floats; a rate on a device, which a captured graph reads, stays there."""
+    """Return learning rate, betas and eps as floats; a rate on a device, which CUDA graphs read, stays there."""
     rate = group["lr"]
     on_device = isinstance(rate, Tensor) and not _checks_gradients(rate)
     return [rate if on_device else float(rate), *map(float, (*group["betas"], group["eps"]))]
@@ -160,7 +160,7 @@ def check_gradients(gradients: list[Tensor | None]) -> None:
 
 
 def is_within(tables: Sequence[Tensor], limit: float) -> bool:
-    """True where the absolute value of every number of tables is below a limit, and none is NaN."""
+    """Return whether the absolute value of every number in tables is below a limit, and none is NaN."""
     if not tables[0].is_cpu:
         return bool(torch.stack([(table.detach().abs() < limit).all() for table in tables]).all())
     # compiled: between renders, whose data fill the caches, an operation of torch takes thirty microseconds
@@ -206,7 +206,7 @@ def _finite_rows(parameters: list[Tensor]) -> Tensor:
 
 
 def _moving_rows(age: Tensor, finite: Tensor | None) -> Tensor | None:
-    """Return a mask of the Gaussians that move, (..., N, 1): of finite gradients, and not frozen; None: all do."""
+    """Return a mask of the Gaussians with finite gradients that are not frozen, (..., N, 1); None: all move."""
     if finite is not None:
         return finite & (age >= 0)
     return age >= 0 if bool((age < 0).any()) else None
@@ -218,7 +218,7 @@ def _write(table: Tensor, values: Tensor, moving: Tensor | None) -> None:
 
 
 def within_bounds(means: Tensor, cholesky: Tensor, bounds: Bounds) -> tuple[Tensor, Tensor]:
-    """Move centres back to about the image, and make Gaussians neither too thin nor larger than the image."""
+    """Move centres back to the image or near it, and make Gaussians neither too thin nor larger than the image."""
     most = bounds.max_factor
     l11, l21, l22 = cholesky.unbind(-1)
     l11, l22, l21 = l11.clamp(bounds.min_factor, most), l22.clamp(bounds.min_factor, most), l21.clamp(-most, most)

@@ -1,7 +1,7 @@
 """The steps of `adam.py` in one launch of Triton: a thread moves a Gaussian, float32, on a CUDA device.
 
-Numbers in between are float64, as in `loops.py`. A Gaussian that is frozen, by a negative age, or whose gradient is not
-finite, stays as it is.
+Intermediate numbers are float64, as in `loops.py`. A Gaussian that is frozen, by a negative age, or whose gradient is
+not finite, stays as it is.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from kcgs.kernels.cuda.triton_function import triton_function
 
 from .settings import Adam, Bounds
 
-# Gaussians of a program
+# Gaussians per program
 _ROWS = 128
 
 
@@ -25,13 +25,13 @@ def step(tables: list[Tensor], gradients: list[Tensor | None], geometry: Adam, c
     Args:
         tables: [..., N, 2], [..., N, 3], [..., N, C], and perhaps [..., N], contiguous.
         gradients: of each table; None where it has none.
-        geometry: of the first two.
-        colors: of the others.
-        bounds: of the first two.
+        geometry: settings and averages of the first two tables.
+        colors: settings and averages of the other tables.
+        bounds: of the first two tables.
     """
     count, channels = tables[0].shape[:-1].numel(), tables[2].shape[-1]
     has_gradient = [gradient is not None for gradient in gradients] + [False]
-    # where there is none any address will do: it is not read
+    # a table without a gradient passes any address: it is not read
     addresses = [table if gradient is None else gradient for table, gradient in zip(tables, gradients, strict=True)]
     opacities = tables[3:] or tables[:1]
     with torch.cuda.device_of(tables[0]):
@@ -55,7 +55,7 @@ def _gradient(gradients, place, mask, EXISTS: tl.constexpr):
 
 @triton.jit  # type: ignore[untyped-decorator]
 def _rate(lr, beta1, beta2, age, LOADED: tl.constexpr):
-    """Return the learning rate over the first average's correction, and the inverse root of the second one's."""
+    """Return the learning rate over the first average's bias correction, and the inverse root of the second's."""
     if LOADED:
         lr = tl.load(lr)
     zero = tl.zeros_like(age)
@@ -82,7 +82,7 @@ def _clamp(value, low, high):
 
 @triton.jit
 def _store(table, place, value, mask):
-    """Write numbers, but none that is not finite in float32."""
+    """Write the numbers that are finite in float32."""
     value = value.to(tl.float32)
     tl.store(table + place, value, mask=mask & (tl.abs(value) < float("inf")))
 

@@ -20,8 +20,8 @@ class FieldState:
 
     field: GaussianField
     optimizer: Any
-    """A GaussianAdam, or what has its `param_groups`, `step`, `append`, `keep`, `state_dict` and `load_state_dict`, and
-    for a batch `freeze` and `frozen_rows`; in a fit also its `rate`, `has_drafts` and `keeps_averages`."""
+    """A GaussianAdam, or an object with its `param_groups`, `step`, `append`, `keep`, `state_dict`, `load_state_dict`,
+    and for a batch `freeze` and `frozen_rows`; in a fit also its `rate`, `has_drafts` and `keeps_averages`."""
     objective: Objective
     renderer: Renderer
     iteration: int = 0
@@ -39,7 +39,7 @@ class FieldState:
 
     @property
     def regions(self) -> RegionMap | None:
-        """The map that Gaussians are confined by."""
+        """The map that confines the Gaussians."""
         return self.renderer.regions
 
     @regions.setter
@@ -52,17 +52,17 @@ class FieldState:
 
 
 def set_rates(state: FieldState, factor: float) -> None:
-    """Set the learning rates to those of the start, times a factor."""
+    """Set the learning rates to their initial values times a factor."""
     for group in state.optimizer.param_groups:
         group["lr"] = group["initial_lr"] * factor
 
 
 def move_field(state: FieldState, rendered: Tensor | None = None) -> None:
-    """Take a step of the optimizer by the gradients of the objective; colours are without opacities.
+    """Take a step of the optimizer by the gradients of the objective; the field has no opacities.
 
     Args:
         state: of the field.
-        rendered: its render, with a graph, where there is one already.
+        rendered: the field's render, with a graph, if there is one already.
     """
     field = state.field
     gradients = state.objective.gradients(state.renderer, state.gaussians, rendered)
@@ -71,7 +71,7 @@ def move_field(state: FieldState, rendered: Tensor | None = None) -> None:
 
 
 def step_field(state: FieldState, rate: float, rendered: Tensor | None = None) -> None:
-    """Move a field once, by a factor of the learning rates, and count the iteration."""
+    """Move a field once, at the initial learning rates times `rate`, and count the iteration."""
     set_rates(state, rate)
     move_field(state, rendered)
     state.iteration += 1

@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 def local_gradient(cholesky: Tensor, means_gradient: Tensor, cholesky_gradient: Tensor) -> Tensor:
-    """Return the gradient by (d1, d2, k11, k21, k22) at no step, (..., N, 5)."""
+    """Return the gradient by (d1, d2, k11, k21, k22) at step 0, (..., N, 5)."""
     l11, l21, l22 = cholesky.unbind(-1)
     gx, gy = means_gradient.unbind(-1)
     g11, g21, g22 = cholesky_gradient.unbind(-1)
@@ -20,7 +20,7 @@ def local_gradient(cholesky: Tensor, means_gradient: Tensor, cholesky_gradient: 
 def move(means: Tensor, cholesky: Tensor, step: Tensor, *, exact: bool = True) -> tuple[Tensor, Tensor]:
     """Take a step (..., N, 5), (d1, d2, k11, k21, k22); return means and factors.
 
-    `exact`: with exp K; False: to first order in k21, as Newton's method has it.
+    `exact` uses exp K; False uses exp K to first order in k21, as Newton's method does.
     """
     d1, d2, k11, k21, k22 = step.unbind(-1)
     l11, l21, l22 = cholesky.unbind(-1)

@@ -18,7 +18,7 @@ from kcgs.nn import GaussianField
 from .adam import COLOR_RANGE, FROZEN, begin, bounds_of, check_gradients, step_groups, within_bounds
 from .run import cosine_decay
 
-# steps of place in standard deviations and of log scale, and steps of colours: found on photos, and good on all images
+# step of centres, in standard deviations, and of log scales; step of colours: tuned on photos, good on all images
 LEARNING_RATE = 0.14
 COLOR_LEARNING_RATE = 0.03
 
@@ -26,22 +26,22 @@ COLOR_LEARNING_RATE = 0.03
 class GaussianAdam(Optimizer):
     r"""Adam in each Gaussian's own frame, so that one learning rate suits Gaussians of all sizes and all images.
 
-    Convention: a step moves a centre by :math:`L d` and a factor to :math:`L \exp K`, with d and the lower triangular K
-    taken by Adam, and colours as Adam does. Every step leaves a valid field: centres stay within two standard
+    Convention: a step moves a centre by :math:`L d` and a factor to :math:`L \exp K`, where d and the lower triangular
+    K are Adam's steps; colours move by Adam's steps. Every step leaves a valid field: centres stay within two standard
     deviations of the image, standard deviations between `min_sigma` and the image's diagonal. A field has two parameter
     groups, its geometry and its colours, each with its own ``lr``, which torch's schedulers change.
 
     Args:
-        fields: a GaussianField, or several; batched ones, too.
-        lr: step of place in standard deviations, and of log scale. A tensor on the device of the fields is read at each
-            replay of a CUDA graph.
+        fields: a GaussianField, or several; fields may be batched.
+        lr: step of centres in standard deviations, and of log scales. A tensor on the device of the fields is read at
+            each replay of a CUDA graph.
         color_lr: step of colours and opacities.
-        betas: of the averages of gradients and of their squares.
-        eps: added to the root of the latter.
-        min_sigma: least standard deviation, in pixels. Thinner Gaussians fit the pixels' centres better, and are dots
-            and needles when a scene is enlarged.
-        max_step: the largest step of place and of log scale.
-        bounded: keep closer bounds, for numbers that a network learns: centres within the image, factors below its
+        betas: decay of the averages of gradients and of squared gradients.
+        eps: added to the root of the average of squared gradients.
+        min_sigma: least standard deviation, in pixels. Thinner Gaussians fit the pixels' centres better, but become
+            dots and needles when a scene is enlarged.
+        max_step: largest step of centres in standard deviations, and of log scales.
+        bounded: keep tighter bounds, for fields that a network learns: centres within the image, factors below its
             longer side, colours in [-1, 2].
 
     Raises:
@@ -121,7 +121,7 @@ class GaussianAdam(Optimizer):
         return loss
 
     def rate(self, progress: float) -> float:
-        """Return the factor of the learning rates in a fit, by the share of it that is over: a cosine from 1 to 0.1."""
+        """Return the factor of the learning rates at the share of a fit that is over: a cosine from 1 to 0.1."""
         return cosine_decay(progress)
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
@@ -129,19 +129,19 @@ class GaussianAdam(Optimizer):
         if "kind" not in param_group:
             expected = "a GaussianField's: train other parameters with an optimizer of their own"
             raise InvalidArgument("param_group", expected, f"one of {[*param_group]}")
-        # unwrapped: torch's decorator, which keeps it out of torch.compile, imports all of its compiler, 1 to 3 seconds
+        # unwrapped: torch's decorator, which keeps it out of torch.compile, imports the compiler, which takes 1 to 3 s
         unwrap(Optimizer.add_param_group)(self, param_group)
 
     @torch.no_grad()
     def append(self, field: GaussianField, added: GaussianField) -> None:
-        """Add the Gaussians of another field to one of the optimizer's; the averages of the others stay.
+        """Add Gaussians to one of the optimizer's fields; the averages of the field's present Gaussians stay.
 
         Args:
-            field: one that the optimizer was made for; it gets new parameters.
-            added: of the same channels, both with region ids and opacities or neither.
+            field: a field that the optimizer was made for; it gets new parameters.
+            added: a field of the same channels, with region ids and opacities if and only if `field` has them.
 
         Raises:
-            ValueError: a field that the optimizer was not made for, or one to which the Gaussians do not fit.
+            ValueError: a field that the optimizer was not made for, or Gaussians that do not fit to it.
         """
         if _layout(field) != _layout(added):
             raise InvalidArgument("added", _layout(field), _layout(added), verb="have")
@@ -163,8 +163,8 @@ class GaussianAdam(Optimizer):
         """Remove all Gaussians but those of a mask from one of the optimizer's fields.
 
         Args:
-            field: one that the optimizer was made for; it gets new parameters.
-            mask: boolean :math:`(N)`, for all images of a batch; or :math:`(B, N)`, with as many in each image.
+            field: a field that the optimizer was made for; it gets new parameters.
+            mask: boolean :math:`(N)`, for all images of a batch; or :math:`(B, N)`, with equal counts in all images.
 
         Raises:
             ValueError: a field that the optimizer was not made for; a mask of another type or shape, or of more
@@ -195,8 +195,8 @@ class GaussianAdam(Optimizer):
         """Leave Gaussians as they are from here on, whatever their gradients.
 
         Args:
-            field: one that the optimizer was made for.
-            mask: of these Gaussians, boolean, :math:`(N)` or :math:`(B, N)` as the field.
+            field: a field that the optimizer was made for.
+            mask: of the Gaussians to freeze, boolean, :math:`(N)` or :math:`(B, N)` as the field.
 
         Raises:
             ValueError: a field that the optimizer was not made for; a mask of another type or shape.
@@ -247,14 +247,14 @@ class GaussianAdam(Optimizer):
 
 
 def _layout(field: GaussianField) -> str:
-    """Say what another field must have to fit to a field."""
+    """Describe what another field must have to be added to a field."""
     *batch, _, channels = field.colors.shape
     optional = [name for name in ("region_ids", "opacities") if getattr(field, name) is not None]
     return " and ".join([f"colors ({', '.join(map(str, [*batch, 'N', channels]))})", *optional])
 
 
 def _select_rows(table: Tensor, index: Tensor, rows: int) -> Tensor:
-    """Return rows of a table, whose dimension they are: (N',) for all images, or (B, N') for each."""
+    """Select rows, which are dimension `rows` of a table; `index` is (N',) for all images, or (B, N')."""
     if index.ndim == 1:
         return table.index_select(rows, index)
     columns = table.shape[2:]

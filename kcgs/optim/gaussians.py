@@ -11,12 +11,12 @@ from torch import Tensor
 from kcgs.functional import RegionMap, region_splat, squared_error_gradients
 from kcgs.nn import GaussianField
 
-# Cutoff of descents whose result is rendered with a smaller one: it saves a third of the weights of 1e-4.
+# cutoff of descents whose result is rendered with a smaller cutoff; it saves a third of the weights of 1e-4
 _DRAFT_CUTOFF = 1e-3
 
 
 def draft_cutoff(cutoff: float) -> float:
-    """Return the cutoff of a descent whose result is rendered with another."""
+    """Return the cutoff of a descent whose result is rendered with `cutoff`."""
     return max(cutoff, _DRAFT_CUTOFF)
 
 
@@ -30,19 +30,19 @@ class Gaussians(NamedTuple):
 
     @classmethod
     def of(cls, field: GaussianField) -> Gaussians:
-        """Take those of a field, without the graph; opacities are merged into the colours."""
+        """Take the Gaussians of a field, without the graph; opacities are merged into the colours."""
         return cls(field.means.detach(), field.cholesky.detach(), field.merged_colors().detach(), field.region_ids)
 
     def of_image(self, index: int) -> Gaussians:
-        """Return those of one image of a batch."""
+        """Return the Gaussians of one image of a batch."""
         return Gaussians(*(table if table is None else table[index] for table in self))  # type: ignore[arg-type]
 
     def field(self, size: tuple[int, int]) -> GaussianField:
-        """Copy them into a field."""
+        """Copy the Gaussians into a field."""
         return GaussianField(*self, size=size)
 
     def map(self, function: Callable[..., Tensor], *others: Gaussians) -> Gaussians:
-        """Apply a function to means, factors and colours, each with those of others; the ids stay."""
+        """Apply a function to means, factors and colours, each with the same tables of `others`; the ids stay."""
         tables = zip(self[:3], *(other[:3] for other in others), strict=True)
         means, cholesky, colors = (function(*numbers) for numbers in tables)
         return Gaussians(means, cholesky, colors, self.region_ids)
@@ -75,13 +75,13 @@ class Renderer(NamedTuple):
         return (self.render(gaussians).detach() - image).square().mean(-3)
 
     def squared_error_gradients(self, gaussians: Gaussians, image: Tensor) -> Gaussians:
-        """Return half the gradients of the squared error of the render as it is, summed over pixels, in one pass."""
+        """Return half the gradients of the squared error of the unclipped render, summed over pixels, in one pass."""
         return Gaussians(
             *squared_error_gradients(image, *gaussians, self.regions, cutoff=self.cutoff, backend=self.backend)
         )
 
     def inner_products(self, gaussians: Gaussians) -> Tensor:
-        """Sum the render over the weights of each Gaussian, (N, C), in one pass where the backend has it."""
+        """Return the inner product of the render and each Gaussian's weights, (N, C), if possible in one pass."""
         # against a black image, half the gradient by a colour is the inner product
         *batch, _, channels = gaussians.colors.shape
         black = gaussians.colors.new_zeros(*batch, channels, *self.size)
@@ -89,7 +89,7 @@ class Renderer(NamedTuple):
 
     @torch.enable_grad()
     def weight_sums(self, gaussians: Gaussians) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
-        """Sum weights per pixel, (1, H, W); return also what sums such a map by the weights of each Gaussian, (N,)."""
+        """Return the weights' sum per pixel, (1, H, W), and a function that sums such a map per Gaussian, (N,)."""
         ones = torch.ones_like(gaussians.colors[:, :1]).requires_grad_()
         total = self.render(gaussians._replace(colors=ones))
         # the render is linear in the colours, so its gradient by them has the sums

@@ -1,4 +1,4 @@
-"""The steps of `adam.py` in compiled loops: tables of float32 on the CPU, numbers in between in float64.
+"""The steps of `adam.py` in compiled loops: tables of float32 on the CPU, intermediate numbers in float64.
 
 With torch operations a fit takes 16 to 20 % longer.
 """
@@ -22,7 +22,7 @@ def _clamp(value, low, high):
 
 @inner
 def _move(numbers, average, square, adam, age):
-    """Put Adam's step in the place of each gradient of a row, and update its averages, all of one age."""
+    """Replace gradients by Adam's steps, and update their averages, which all have one age."""
     rate, root = adam.lr / (1.0 - adam.beta1**age), 1.0 / math.sqrt(1.0 - adam.beta2**age)
     for i in range(len(numbers)):
         gradient = np.float64(numbers[i])
@@ -34,7 +34,7 @@ def _move(numbers, average, square, adam, age):
 
 @inner
 def _step(numbers, adam, begin):
-    """Put Adam's steps in the place of gradients [N, K], of rows from `begin` on; rows of one age go together.
+    """Replace gradients [N, K], of rows from `begin` on, by Adam's steps; adjacent rows of one age go together.
 
     Rows of a negative age are frozen: their step is 0.
     """
@@ -71,7 +71,7 @@ def _widen(l11, l21, l22, min_sigma):
 
 @program.entry
 def is_within(tables, limit):
-    """True where every number of rows is smaller than a limit, and not NaN."""
+    """Return whether the absolute value of every number of tables is below a limit, and none is NaN."""
     within = True
     for numbers in tables:
         for i in range(len(numbers)):
@@ -122,7 +122,7 @@ def _step_geometry(means, cholesky, means_gradient, cholesky_gradient, moves, ad
 
 @program.entry
 def step_tables(tables, gradient, adam):
-    """Move tables of rows whose gradients [N, K] are beside each other."""
+    """Move tables by their gradients, which are side by side in one array [N, K]."""
     steps, column = gradient.copy(), 0
     _step(steps, adam, 0)
     for table in tables:

@@ -17,7 +17,7 @@ from .objectives import ImageObjective, Residual
 if TYPE_CHECKING:
     from .similarity import Passes
 
-# weight of the squared error, and that on a reduced photo: few Gaussians, where MS-SSIM likes stray strokes
+# weight of the squared error, and its weight on a reduced photo: it has few Gaussians, and MS-SSIM likes stray strokes
 _SQUARED = 0.003
 _SQUARED_REDUCED = 0.03
 # least mean of a scale, since the logarithm has no bound at 0
@@ -25,23 +25,24 @@ _MIN_SCORE = 0.2
 
 
 class MsSsim(ImageObjective):
-    r"""What MS-SSIM lacks, as its logarithm, and a little of the squared error.
+    r"""The negative logarithm of MS-SSIM, and a little of the squared error.
 
     .. math:: E(r) = -\sum_k w_k \log \overline{s_k} / Z + 0.003 |r|^2, \quad
         1 - s_k = \frac{v(P_k r)}{v(P_k x) + v(P_k (x + r)) + 0.03^2}
 
-    x is the image, :math:`P_k` averages blocks, v is the variance under the window of SSIM, and the last :math:`s_k` is
-    times the luminance. Scales and weights are those of :func:`kcgs.functional.ms_ssim`, without the finest, which
-    has a weight of 4 % and would take three quarters of the time. Of the windows, which overlap, those at even rows and
-    columns count. Those that the border cuts count as much as others, else the outer tenth of an image would count
-    little. Near the image E is quadratic, and `importance` and `weigh`
-    are that form's. Farther off it is not: where texture is missing, more variance in the render is better, so `slope`
-    is half the gradient of E itself.
+    x is the image, r the render minus the image, :math:`P_k` averages blocks, v is the variance under the window of
+    SSIM, and the last :math:`s_k` is multiplied by the luminance. Z is such that the weights of squared differences
+    near the image, averaged over pixels, sum to 1 over the scales. Scales and weights are those of
+    :func:`kcgs.functional.ms_ssim`, without the finest, which has a weight of 4 % and would take three quarters of the
+    time. Windows overlap, so only those at even rows and columns count. Windows that the border cuts count as much as
+    others, else the outer tenth of an image would count little. Near the image E is quadratic, and `importance` and
+    `weigh` belong to that quadratic form. Farther from the image E is not: where texture is missing, more variance in
+    the render is better, so `slope` is half the gradient of E itself.
 
     Args:
         image: (C, H, W) in [0, 1], or a batch of them.
-        reduction: factor by which the sides of a photo were reduced to those of the image. Its scales keep their
-            weights, so the finest ones are left out; the squared error has ten times the weight.
+        reduction: factor by which the sides of a photo were reduced to those of the image. The photo's scales keep
+            their weights, so the finest scales are left out; the squared error has ten times the weight.
 
     Example:
         >>> image = torch.rand(3, 48, 64, generator=torch.Generator().manual_seed(0))
@@ -66,7 +67,7 @@ class MsSsim(ImageObjective):
             variance, weight = (square - mean * mean).clamp_min(0.0), weight / plane.shape[-2:].numel()
             self._scales.append((plane, inside, mean, variance, weight))
             masks.append(_blur(inside * weight / (2.0 * variance + K2**2)).mean(-3))
-        # of each image, in float64
+        # Z of each image, in float64
         self._norm = image.new_zeros(image.shape[:-3], dtype=torch.float64)
         for mask in masks:
             self._norm += mask.mean((-2, -1))
@@ -112,7 +113,7 @@ class MsSsim(ImageObjective):
         return gradient
 
     def value(self, render: Tensor) -> Tensor:
-        """Return E of a render that is clipped to [0, 1], as a mean over pixels and channels, in float64; or (B,)."""
+        """Return E of a render, clipped to [0, 1], as a mean over pixels and channels, () or (B,) float64."""
         difference = render.clamp(0.0, 1.0) - self.image
         if self._passes is None:
             total = self._measure(difference)[0].double()
@@ -123,19 +124,19 @@ class MsSsim(ImageObjective):
         return total / difference.shape[-2:].numel() + self._squared * squared
 
     def residual(self, render: Tensor) -> Residual:
-        """Return each pixel's gradient by the root of what it counts: the square is what a Gaussian may gain."""
+        """Return the negative slope over the root of the importance; its square is what a Gaussian may gain."""
         root = self.importance.sqrt()
         return Residual(-self._slope(render - self.image) / root.unsqueeze(-3), root)
 
     def weigh(self, gaussians: Gaussians) -> Tensor:
-        """Return about what the squared error of Gaussians counts in E, by their places and sizes, (..., N)."""
+        """Return about the weight of each Gaussian's squared error in E, by its place and size, (..., N)."""
         l11, l21, l22 = gaussians.cholesky.detach().unbind(-1)
         xx, xy, yy = l11**2, l11 * l21, l21**2 + l22**2
         x, y = gaussians.means.detach().floor().long().unbind(-1)
         total = torch.zeros_like(xx)
 
         def energy_after(variance: float) -> Tensor:
-            """Share of a Gaussian's energy that is left after a blur, which adds its variance."""
+            """Return the share of a Gaussian's energy that is left after a blur of this variance."""
             return l11 * l22 / ((xx + variance) * (yy + variance) - xy**2).sqrt()
 
         for level, fine, coarse, mask in self._bands:
@@ -151,7 +152,7 @@ class MsSsim(ImageObjective):
         for level, (image, inside, mean, variance, weight) in enumerate(self._scales, 1):
             plane = halve(plane)
             render = image + plane
-            # one after the other, which stays in a processor's cache
+            # one blur after the other, so that each stays in a processor's cache
             render_mean, square, product = (inside * _blur(t) for t in (render, render * render, image * render))
             variances = (square - render_mean * render_mean).clamp_min_(0.0).add_(variance).add_(K2**2)
             structure = (product - mean * render_mean).mul_(2.0).add_(K2**2).div_(variances)
@@ -163,7 +164,7 @@ class MsSsim(ImageObjective):
             windows = (structure * luminance)[..., ::2, ::2]
             score, area = windows.mean((-2, -1)).clamp_min(_MIN_SCORE), mean.shape[-2:].numel()
             total -= (weight / self._norm * area).to(total) * score.log().mean(-1)
-            # of windows at even rows and columns, for all
+            # windows at even rows and columns stand for all windows
             share = torch.zeros_like(plane)
             factor = (weight / self._norm * 0.25**level * area / windows.shape[-2:].numel()).to(share)
             share[..., ::2, ::2] = inside[:, ::2, ::2] * factor.view(*factor.shape, 1, 1, 1) / score[..., None, None]
@@ -175,7 +176,7 @@ class MsSsim(ImageObjective):
 
     @staticmethod
     def _sum_up(planes: list[Tensor]) -> Tensor:
-        """Add to each plane what the blocks of the coarser ones have; the planes are written to."""
+        """Add to each pixel of the finest plane the values of its blocks in coarser planes; all planes change."""
         for fine, coarse in zip(planes[-2::-1], planes[:0:-1], strict=True):
             height, width = coarse.shape[-2:]
             blocks = fine[..., : 2 * height, : 2 * width].unflatten(-1, (width, 2)).unflatten(-3, (height, 2))

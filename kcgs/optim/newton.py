@@ -14,7 +14,7 @@ from .objectives import Objective
 # half the second derivatives of the squared error by a step in a Gaussian's frame, per energy of the Gaussian: two of
 # the centre, three of the factor (docs/format.md has the derivation)
 _CURVATURE = (0.5, 0.5, 0.75, 0.25, 0.75)
-# energies below it count as this one: next to nothing bends the error there
+# least energy of a Gaussian in a step: with less, the error would have next to no curvature
 _MIN_ENERGY = 1e-2
 # pixels: on pixel centres a narrower Gaussian weighs as if it had this standard deviation
 _MIN_SIGMA = 0.56
@@ -27,7 +27,7 @@ _MOMENTUM = 0.9
 
 
 class NewtonDescent:
-    """Newton steps of every number alone, in each Gaussian's frame, with momentum.
+    """Newton steps of every number by itself, in each Gaussian's frame, with momentum.
 
     A number with a small gradient hardly moves, while Adam moves all numbers about as far.
 
@@ -51,7 +51,7 @@ class NewtonDescent:
         self.gaussians, self.objective, self.renderer = gaussians, objective, renderer
         self.exact, self.min_sigma = exact, min_sigma
         self.velocity = torch.zeros_like(torch.cat(gaussians[:3], -1))  # [N, 5 + C]
-        self.frozen: Tensor | None = None  # numbers that do not move, bool, (N, 5 + C) or what broadcasts to it
+        self.frozen: Tensor | None = None  # numbers that do not move, bool, (N, 5 + C) or broadcast to it
         self.iteration, self.progress = 0, 0.0
 
     def step(self, rate: float) -> None:

@@ -15,19 +15,19 @@ from .gaussians import Gaussians, Renderer
 
 Loss = Callable[[Tensor], Tensor]
 
-# steps along the slope of a loss that are tried, each half as long as the one before
+# number of steps along the slope of a loss that are tried, each half as long as the one before
 _NUM_STEPS = 10
 
 
 class Residual(NamedTuple):
-    """What a render lacks: `error` is weighted, and the colours of Gaussians that are proposed for it go by `root`."""
+    """What a render lacks, as a weighted error; colours of Gaussians proposed for it are divided by `root`."""
 
     error: Tensor  # [..., C, H, W], its square is what a Gaussian may gain
     root: Tensor | float = 1.0  # [..., H, W], root of each pixel's weight, by which colours are divided
 
 
 class Objective(ABC):
-    """What a descent lowers: a function of the render, (..., C, H, W), with its slope; of a batch for each image."""
+    """What a descent lowers: a function of the render, (..., C, H, W), with its slope; one value per image."""
 
     is_ranked_by_psnr = True
     """The best state of a descent has the highest PSNR; False: the lowest value."""
@@ -38,8 +38,8 @@ class Objective(ABC):
     def slope(self, render: Tensor) -> Tensor:
         """Return the gradient at a render, whose memory this method may overwrite, times a positive factor.
 
-        The gradient is that of the value times the number of values. The factor is one half for the objectives of
-        Newton's method, the squared error and MS-SSIM; Adam ignores it.
+        The gradient is taken of the value times the number of values, so of a sum where the value is a mean. The factor
+        is one half for the objectives of Newton's method, the squared error and MS-SSIM; Adam ignores it.
         """
 
     @abstractmethod
@@ -51,24 +51,24 @@ class Objective(ABC):
         """Return what a render lacks."""
 
     def weigh(self, gaussians: Gaussians) -> Tensor:
-        """Return about what the squared error of each Gaussian weighs, (..., N)."""
+        """Return about the weight of each Gaussian's squared error, (..., N)."""
         return torch.ones_like(gaussians.means[..., 0])
 
     def has_fused_gradients(self, renderer: Renderer) -> bool:
-        """Whether gradients need no render of their own."""
+        """Return whether gradients need no render of their own."""
         return False
 
     def gradients(self, renderer: Renderer, gaussians: Gaussians, render: Tensor | None = None) -> Gaussians:
         """Return the gradients by Gaussians, times the factor of `slope`.
 
-        A render may be given, with a graph to them.
+        A `render` that is given has a graph to the Gaussians.
         """
         leaves = gaussians
         if render is None:
             leaves = gaussians.map(lambda table: table.detach().requires_grad_())
             with torch.enable_grad():
                 render = renderer.render(leaves)
-        # `data`: the slope may overwrite it, which the graph does not mind
+        # `data`, since the slope may overwrite it, which the graph does not notice
         return Gaussians(*torch.autograd.grad(render, leaves[:3], self.slope(render.data)))
 
 
@@ -84,7 +84,7 @@ class ImageObjective(Objective):
 
 
 class SquaredError(ImageObjective):
-    """The squared error, with a weight of each pixel, (H, W), if there is one."""
+    """The squared error, with an optional weight of each pixel, (H, W)."""
 
     def __init__(self, image: Tensor, weight: Tensor | None = None) -> None:
         super().__init__(image)
@@ -102,7 +102,7 @@ class SquaredError(ImageObjective):
         return (square if self.weight is None else self.weight * square).mean((-3, -2, -1))
 
     def has_fused_gradients(self, renderer: Renderer) -> bool:
-        """Whether the error is that of all pixels of the render as it is."""
+        """Return whether the error is unweighted and the render unclipped."""
         return self.weight is None and renderer.bounds is None
 
     def gradients(self, renderer: Renderer, gaussians: Gaussians, render: Tensor | None = None) -> Gaussians:
@@ -127,11 +127,11 @@ class AbsoluteError(ImageObjective):
 
 
 class LossObjective(Objective):
-    """A loss of the user's.
+    """A loss of the user.
 
     Args:
-        loss: from a render, (1, C, H, W), to a scalar.
-        image: (1, C, H, W). Gaussians are added where the render differs from it; None: where the loss has its slope.
+        loss: takes a render, (1, C, H, W), and returns a scalar.
+        image: (1, C, H, W). Gaussians are added where the render differs from it; None: along the slope of the loss.
     """
 
     is_ranked_by_psnr = False
@@ -154,9 +154,9 @@ class LossObjective(Objective):
         return self._check(self.loss(render.detach())).reshape(1)
 
     def residual(self, render: Tensor) -> Residual:
-        """Return what the render lacks of the image; without one, the step along the slope that lowers the loss most.
+        """Return the image minus the render; without an image, the step along the slope that lowers the loss most.
 
-        The longest that is tried changes one value by 1.
+        The longest step that is tried changes the value with the largest slope by 1.
         """
         if self.image is not None:
             return Residual(self.image - render)

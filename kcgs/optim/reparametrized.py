@@ -1,4 +1,4 @@
-"""A torch optimizer on other parameters than those of a field."""
+"""A torch optimizer of parameters that stand for the Gaussians of a field."""
 
 from __future__ import annotations
 
@@ -19,14 +19,15 @@ class ReparametrizedOptimizer(ABC):
     """A torch optimizer that moves parameters of its own, and writes the Gaussians that they stand for into a field.
 
     Convention: a subclass has `encode`, from a field to parameters, and `decode`, from parameters to Gaussians. A step
-    takes the gradients of the field back to the parameters. The last parameter is the colours as they are, which share
-    their memory with the field's: a fit writes into them. It has the methods of :class:`kcgs.optim.GaussianAdam` that a
-    fit calls. When Gaussians are added, removed or frozen, the averages of all start anew.
+    takes the gradients of the field back to the parameters. The last parameter is the colours, unchanged, which share
+    their memory with the field's: a fit writes into them. The class has the methods of
+    :class:`kcgs.optim.GaussianAdam` that a fit calls. When Gaussians are added, removed or frozen, the averages of all
+    Gaussians start anew.
 
     Args:
         field: of an image or a batch; it gets new parameters.
         rates: the learning rate of each parameter, in the order of `encode`.
-        make: from parameter groups to a torch optimizer, such as ``torch.optim.Adam``.
+        make: makes a torch optimizer from parameter groups, such as ``torch.optim.Adam``.
 
     Raises:
         ValueError: a field with opacities.
@@ -64,14 +65,14 @@ class ReparametrizedOptimizer(ABC):
 
     @abstractmethod
     def encode(self, field: GaussianField) -> list[Tensor]:
-        """Return the parameters of a field's Gaussians, each :math:`(..., N, K)`; the colours as they are come last."""
+        """Return the parameters of a field's Gaussians, each :math:`(..., N, K)`; the unchanged colours come last."""
 
     @abstractmethod
     def decode(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return means, cholesky and colors of `self.parameters`, with their graph."""
 
     def rate(self, progress: float) -> float:
-        """Return the factor of the learning rates, by the share of a fit that is over: they are constant."""
+        """Return the factor of the learning rates at the share of a fit that is over: always 1."""
         return 1.0
 
     @property

@@ -1,4 +1,4 @@
-"""The loop of every descent: steps, and what happens between them."""
+"""The loop of every descent: steps, and events between them."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
-# the rate at the end of a descent by Adam, in units of that at its start
+# the rate at the end of a descent by Adam, in units of the rate at its start
 _FINAL_DECAY = 0.1
 
 
 class Descent(Protocol):
-    """Gaussians on their way to less error."""
+    """Gaussians that `run` moves to less error."""
 
     iteration: int
     progress: float  # share of the descent that is over
@@ -19,12 +19,12 @@ class Descent(Protocol):
 
 @runtime_checkable
 class Event(Protocol):
-    """Something that happens to descents of some kind from time to time."""
+    """An action between the steps of a descent, which `run` offers before every step."""
 
     def act(self, descent: Any) -> str | None:
         """Change or observe the descent, if it is time to; return why the descent ends here, or None.
 
-        Called before every step, so an event knows itself when it acts.
+        `run` calls it before every step; the event itself decides when to act.
         """
 
 
@@ -35,14 +35,14 @@ def run(
     events: Sequence[Event],
     rate: Callable[[float], float],
 ) -> str:
-    """Let events act and step, until an event gives a reason to end; return the reason.
+    """Let events act, then step, until an event gives a reason to end; return the reason.
 
     Args:
-        descent: what moves.
-        step: moves it once, by a share of the largest step, and counts the iteration.
+        descent: the state that moves.
+        step: moves the descent once, by a share of the largest step, and counts the iteration.
         progress: share of the descent that is over, from 0 to 1.
         events: act before a step, in this order.
-        rate: of the steps, by progress.
+        rate: share of the largest step, by progress.
     """
     while True:
         descent.progress = progress()
@@ -53,12 +53,12 @@ def run(
 
 
 def count_iterations(descent: Descent, iterations: float) -> Callable[[], float]:
-    """Return a progress that is the share of so many iterations."""
+    """Return a function that gives the share of `iterations` that a descent has done."""
     return lambda: descent.iteration / iterations if iterations else 1.0
 
 
 class End:
-    """Ends a descent at a share of it."""
+    """Ends a descent when a share `until` of it is over."""
 
     def __init__(self, until: float = 1.0, reason: Callable[[], str] = lambda: "iterations") -> None:
         self.until, self.reason = until, reason
@@ -69,7 +69,7 @@ class End:
 
 
 class TimedAction:
-    """Acts once at each of some shares of a descent, which ascend."""
+    """Acts once at each of several ascending shares of a descent."""
 
     def __init__(self, times: Iterable[float], action: Callable[[], None]) -> None:
         self._times, self._action = iter([*times, math.inf]), action

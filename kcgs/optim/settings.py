@@ -1,4 +1,4 @@
-"""What a step of Adam in a Gaussian's frame is given, compiled for a CPU or for a GPU."""
+"""Arguments of the compiled steps of Adam in a Gaussian's frame, on a CPU and on a GPU."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 
 class Adam(NamedTuple):
-    """Settings of a group, and the averages of its tables beside each other, K columns; arrays, or tensors."""
+    """Settings of a parameter group, and the averages of its tables, side by side in K columns; arrays or tensors."""
 
     lr: Any  # a number; on a GPU perhaps a tensor
     beta1: float

@@ -1,6 +1,6 @@
-"""The objective `ms-ssim` on the CPU: what its compiled loops work on, and when.
+"""The objective `ms-ssim` on the CPU: the arrays and the tasks of its compiled loops.
 
-A gradient at 480p takes one core 2.4 ms, with torch operations 18.
+On one core a gradient at 480p takes 2.4 ms, with torch operations 18 ms.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from kcgs.functional import window_taps
 
 from .similarity_loops import CHANNEL, HALVE, HEIGHT, MARGIN, PADDING, SCALE, SCORE, SUM, WIDTH, Scales, run_phases
 
-# rows of the finest scale per task, a multiple of the blocks of the coarsest
+# rows of the finest scale per task, a multiple of the rows of a block of the coarsest scale
 _ROWS = 64
 
 
@@ -24,9 +24,9 @@ class Passes:
     """The objective and its gradient at differences from an image, or from each of a batch.
 
     Args:
-        scales: of each scale the images, (B C, h, w), the inverse of the window's part inside of them, (1, h, w), mean
-            and variance under the window, (B C, h, w).
-        factors: weight of each scale, by the gradient's norm, of each image, (S, B).
+        scales: for each scale the images, (B C, h, w), the inverse of the window's sum inside the image, (1, h, w),
+            mean and variance under the window, (B C, h, w).
+        factors: weight of each scale over the norm of each image, (S, B).
         least: least mean score of a scale.
     """
 
@@ -41,7 +41,7 @@ class Passes:
         inside, mean, variance = (
             np.concatenate([scale[k][:, ::2, ::2].ravel() for scale in scales]) for k in (1, 2, 3)
         )
-        # the weight of a pixel is for windows at all pixels
+        # `factors` are for windows at all pixels; the loops take windows at even rows and columns
         weights = (factors.repeat(self._channels // factors.shape[1], 1).T * areas[:, 0] / areas[:, 2]).T.copy()
         render, planes = np.zeros_like(image), np.empty(self._channels * areas[:, 0].sum(), np.float32)
         settings = table, self._channels, weights, least, taps
@@ -59,7 +59,7 @@ class Passes:
         return np.array([(scale, c, y, min(y + _ROWS, height)) for c in range(self._channels) for y in firsts])
 
     def value(self, difference: NDArray[Any]) -> NDArray[Any]:
-        """Return what MS-SSIM lacks, as its weighted logarithm, summed over pixels and averaged over channels, (B,)."""
+        """Return the negative weighted logarithm of MS-SSIM, summed over pixels, averaged over channels, (B,)."""
         sums, table = self._run(difference, self._value_tasks), self._scales.table
         scores = np.zeros((len(table), self._channels))
         np.add.at(scores, (self._value_tasks[:, SCALE], self._value_tasks[:, CHANNEL]), sums)
@@ -72,7 +72,7 @@ class Passes:
         return totals
 
     def differentiate(self, difference: NDArray[Any], squared: float) -> None:
-        """Replace a difference, (B C, H, W), contiguous float32, by half the gradient and `squared` times itself."""
+        """Replace a difference, (B C, H, W), contiguous float32, by half the gradient plus `squared` times itself."""
         self._run(difference, self._tasks, squared)
 
     def _run(self, difference: NDArray[Any], tasks: Any, squared: float = 0.0) -> NDArray[Any]:

@@ -25,7 +25,7 @@ PHASE = 1
 SCALE = 2
 CHANNEL = 3
 FIRST = 4
-LAST = 5  # row + 1
+LAST = 5  # last row + 1
 # phases
 HALVE = 0  # average blocks of the difference for the rows of all scales
 SCORE = 1  # the score of a scale, and the gradient by its pixels without the factor of the mean score
@@ -41,12 +41,12 @@ class Scales(NamedTuple):
     """
 
     table: Any  # [S, 5] int64
-    channels: int  # C, of a batch all of all images
-    factors: Any  # [S, C] float64: weight of a window by the gradient's norm
+    channels: int  # C, for a batch the sum over its images
+    factors: Any  # [S, C] float64: weight of a window over the norm of its image
     least: float  # least mean score of a scale
     taps: Any  # [6] of the window, its centre first
     image: Any  # padded, C
-    inside: Any  # of windows: inverse of the part inside the image
+    inside: Any  # of windows: inverse of the sum of taps inside the image
     mean: Any  # of windows, C, of the image
     variance: Any  # of windows, C
     render: Any  # padded, C, written to
@@ -55,7 +55,7 @@ class Scales(NamedTuple):
 
 @inner
 def _taps(scales):
-    """Return the taps as numbers: in an array a store to another one might change them."""
+    """Return the taps as numbers: a compiler must assume that a store to another array changes an array."""
     taps = scales.taps
     return taps[0], taps[1], taps[2], taps[3], taps[4], taps[5]
 
@@ -90,7 +90,7 @@ def _across(row, taps, target):
 
 @inner
 def _up(slopes, k, taps, upper, lower):
-    """Spread windows along columns to the row of pixels of window row k + 2, and the next."""
+    """Spread windows along columns to two rows of pixels: the row of window row k + 2, and the next row."""
     for x in range(slopes.shape[1]):
         a, b, c = slopes[k, x], slopes[k + 1, x], slopes[k + 2, x]
         d, e, f = slopes[k + 3, x], slopes[k + 4, x], slopes[k + 5, x]
@@ -127,7 +127,7 @@ def _padded(flat, scales, scale, channel):
 
 @inner
 def _windows(flat, scales, scale, index, count):
-    """Return a number of the windows of a scale, one of `count`."""
+    """Return array `index` of the `count` arrays that hold a number for each window of a scale."""
     table = scales.table
     height, width = (table[scale, HEIGHT] + 1) // 2, (table[scale, WIDTH] + 1) // 2
     start = count * table[scale, WINDOW_START] + index * height * width
@@ -136,7 +136,7 @@ def _windows(flat, scales, scale, index, count):
 
 @inner
 def _halve(scales, difference, channel, first, last):
-    """Fill rows of all scales, those of the finest from first to last: averages of blocks, and the render."""
+    """Fill averages of blocks, and the render, on all scales, for rows `first` to `last` of the finest scale."""
     table, quarter = scales.table, np.float32(0.25)
     for scale in range(len(table)):
         target = _plane(scales, scale, channel)
@@ -188,7 +188,7 @@ def _brighten(means, inside, mean, scores, slopes):
 
 @inner
 def _score(scales, scale, channel, first, last, has_gradient):
-    """Fill rows of the gradient by the pixels of a scale, the first even; return the sum of the scores of windows."""
+    """Fill rows of the gradient by the pixels of a scale, from an even row; return the sum of the windows' scores."""
     taps = _taps(scales)
     render = _padded(scales.render, scales, scale, channel)
     image = _padded(scales.image, scales, scale, channel)
@@ -265,7 +265,7 @@ def _mean_score(scales, sums, tasks, scale, channel):
 
 @inner
 def _add(row, factor, coarse):
-    """Multiply a row by a factor, and add to it what the blocks of a coarser one have."""
+    """Multiply a row by a factor, and add to each pixel the value of its block in a coarser row."""
     for x in range(len(coarse)):
         row[2 * x] = row[2 * x] * factor + coarse[x]
         row[2 * x + 1] = row[2 * x + 1] * factor + coarse[x]
@@ -275,7 +275,7 @@ def _add(row, factor, coarse):
 
 @inner
 def _sum(scales, difference, squared, sums, tasks, k):
-    """Fill rows of the gradient by the image's pixels: the coarser scales' are added to the finer ones'."""
+    """Fill rows of the gradient by the image's pixels: gradients of coarser scales are added to finer scales."""
     table, channel = scales.table, tasks[k, CHANNEL]
     first, last = tasks[k, FIRST], tasks[k, LAST]
     nothing = np.empty(0, np.float32)
