@@ -1,4 +1,4 @@
-"""Compiled loops: functions that numba compiles when they are first called, and keeps on disk by the text of sources.
+"""Compiled loops: functions that numba compiles on their first call, and that are kept on disk by their sources.
 
 To add one, write in the module that calls it:
 
@@ -7,7 +7,7 @@ To add one, write in the module that calls it:
 3. `@inner` above a function that only compiled functions call, `@inline` where it is small and called often,
    `@inline_once` where it is large and called once.
 
-Where the module's text changes, or that of a module of kcgs that it imports at its top, its functions compile anew.
+If the text of the module changes, or of a module of kcgs that it imports at its top, its functions are compiled anew.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ _PACKAGE = Path(__file__).parents[1]
 _IMPORT = re.compile(r"^from (\.+|kcgs\b)\.?([\w.]*) import (\([^)]*\)|.*)", re.MULTILINE)
 _DIGEST_BYTES = hashlib.sha256().digest_size
 
-# without entry points for Python functions compile in less time
+# for functions that Python does not call: without entry points they compile in less time
 inner = cast(Any, numba.njit)(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
-# the same, of which every caller has a copy
+# as `inner`, but every caller has a copy
 inline = cast(Any, numba.njit)(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", forceinline=True)
 
-# of one caller, and part of its code from the first: compiled once, not alone and then again with it
+# for a function with one caller: it is compiled once, as part of its caller, and not by itself before
 inline_once = cast(Any, numba.njit)(
     no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", inline="always"
 )
@@ -64,7 +64,7 @@ class Program:
 
     @functools.cached_property
     def folder(self) -> Path | None:
-        """The folder of what its loops compile to; None: there is none."""
+        """The folder of the compiled code; None: no folder can be written."""
         return _find_folder()
 
     def announce(self) -> None:
@@ -78,7 +78,7 @@ class Program:
 
 
 class _Cache(NullCache):
-    """What a function compiles to, on disk: for each signature a file of a pickle with its SHA-256 in front.
+    """The compiled code of a function on disk: for each signature a file of a SHA-256, then the pickle it belongs to.
 
     numba's own cache sees a change of one source only, and hands damaged code to LLVM, which may abort the process.
     """
@@ -121,10 +121,10 @@ class _Cache(NullCache):
 
 
 def _read_compiled(path: Path) -> bytes | None:
-    """Return the pickle in a file; None if there is none, or a damaged one."""
+    """Return the pickle in a file; None if there is no file, or it is damaged."""
     try:
         data = path.read_bytes()
-    except OSError:  # what cannot be replaced either makes `save_overload` warn
+    except OSError:  # `save_overload` warns if the file cannot be replaced either
         return None
     digest, content = data[:_DIGEST_BYTES], data[_DIGEST_BYTES:]
     if hashlib.sha256(content).digest() == digest:
@@ -134,7 +134,7 @@ def _read_compiled(path: Path) -> bytes | None:
 
 
 def _find_folder() -> Path | None:
-    """Return the first folder that can be written; None: there is none."""
+    """Return the first folder that can be written; None: no folder can."""
     user = AppDirs(appname="kcgs", appauthor=False).user_cache_dir
     folders = [_config.CACHE_DIR] if _config.CACHE_DIR else [user, Path(__file__).parent / "__pycache__"]
     for folder in map(Path, folders):
@@ -152,7 +152,7 @@ def _hash_sources(file: Path) -> list[str]:
 
 
 def _find_sources(file: Path) -> set[Path]:
-    """Return a file, the files of kcgs that it imports at its top, those that these import, and tables beside them."""
+    """Return a file, the files of kcgs that it imports at its top, directly or not, and tables beside them."""
     sources: set[Path] = set()
     pending = [file]
     while pending:
@@ -165,7 +165,7 @@ def _find_sources(file: Path) -> set[Path]:
 
 @functools.cache
 def _find_imports(file: Path) -> list[Path]:
-    """Return the files that hold what a file imports from kcgs; names that a package re-exports are in one of its."""
+    """Return the files that define what a file imports from kcgs, also where a package re-exports it."""
     return [source for module, names in _read_imports(file) for name in names for source in _find_origin(module, name)]
 
 
@@ -180,7 +180,7 @@ def _read_imports(file: Path) -> list[tuple[Path, list[str]]]:
 
 
 def _find_origin(module: Path, name: str) -> list[Path]:
-    """Return the file that has a name of a module of kcgs, if there is such a module."""
+    """Return the file that defines a name of a module of kcgs; none, if there is no such module."""
     if not module.is_dir():
         return [source] if (source := Path(f"{module}.py")).is_file() else []
     for origin, names in _read_imports(module / "__init__.py"):

@@ -1,14 +1,14 @@
 """Tasks that threads take from a shared counter, for compiled loops.
 
-A compiled function receives `tasks`, int64, a row for each. The first column says how many tasks, from the first on,
-must be done before this one begins. Its loop is::
+A compiled function receives `tasks`, int64, with a row per task. The first column is the number of tasks, counted from
+the first, that must be done before the task of the row begins. The loop of the function is::
 
     k = first_task(tasks, counters)
     while k >= 0:
         ...  # task tasks[k]
         k = next_task(tasks, counters, k)
 
-Which thread takes which task is left to chance, so a task writes where none does that may run beside it.
+Any thread may take any task, so tasks that may run at the same time write to different memory.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from kcgs._numba_internals import cgutils
 from .program import inner
 from .threads import num_threads
 
-# first column of tasks: how many of them, from the first on, must be done before
+# first column of tasks: number of tasks, counted from the first, that must be done before
 START = 0
 
 # places of counters
@@ -46,7 +46,7 @@ _CANCELLED = 1 << 62
 
 _MOST_RANGES = 256
 
-# times that a thread yields before it sleeps, so that one that was interrupted finds a processor
+# times that a thread yields before it sleeps, so that an interrupted thread finds a processor
 _YIELDS = 400
 _MICROSECONDS = 20  # of a sleep
 
@@ -57,10 +57,10 @@ def run_tasks(function: Callable[[Any, Any], None], tasks: Any, work: int | None
     An exception in one thread ends the others after their present tasks, and reaches the caller.
 
     Args:
-        function: a loop over tasks, as above.
-        tasks: see above.
+        function: a loop over tasks, see the module.
+        tasks: see the module.
         work: number of rows, pairs or pixels; None: there are as many threads as tasks.
-        per_thread: of them, for which another thread is woken.
+        per_thread: amount of work for which another thread is woken.
     """
     counters, errors, running = np.zeros(_FLAGS + len(tasks), np.int64), list[BaseException](), list[None]()
 
@@ -76,11 +76,11 @@ def run_tasks(function: Callable[[Any, Any], None], tasks: Any, work: int | None
 
     count = min(num_threads(), len(tasks) if work is None else 1 + work // per_thread)
     if count > 1:
-        # one that starts too late finds nothing to do, so nobody waits for it
+        # a thread that starts too late finds no task, so the caller does not wait for it
         _helpers(os.getpid()).call(run, count - 1)
     run()
     if errors:
-        while running:  # they still write to what the caller is about to give up
+        while running:  # the other threads still write to memory that the caller is about to free
             time.sleep(1e-3)
         raise errors[0]
 
@@ -118,7 +118,7 @@ def _helpers(process: int) -> _Helpers:
 
 
 def phases(*parts: Any) -> Any:
-    """Join the tasks of phases, (T, K) int64 each, and put the tasks that must be done before them in front."""
+    """Join the tasks of phases, (T, K) int64 each; the first column is the number of tasks of all phases before."""
     starts = np.repeat(np.cumsum([0, *map(len, parts[:-1])]), [len(part) for part in parts])
     return np.column_stack([starts, np.concatenate(parts)])
 
@@ -132,13 +132,13 @@ def chunks(count: int, size: int, most: int) -> Any:
 
 @functools.lru_cache(maxsize=64)
 def ranges(count: int, size: int) -> Any:
-    """Return tasks of one phase that are ranges of so many rows, each of at least about `size`: first and last + 1."""
+    """Return tasks of one phase: ranges of so many rows, each of at least about `size`, as first and last + 1."""
     return phases(chunks(count, size, _MOST_RANGES))
 
 
 @intrinsic
 def _add(typing_context, counters, place):
-    """Add 1 to a counter at once for all threads; return what it was."""
+    """Add 1 to a counter atomically; return its value before."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.atomic_rmw("add", _pointer(context, builder, signature, arguments), _long(1), "seq_cst")
@@ -148,7 +148,7 @@ def _add(typing_context, counters, place):
 
 @intrinsic
 def _read(typing_context, counters, place):
-    """Return a counter, which other threads change."""
+    """Return the value of a counter, which other threads change."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.load_atomic(_pointer(context, builder, signature, arguments), "acquire", 8)
@@ -158,7 +158,7 @@ def _read(typing_context, counters, place):
 
 @intrinsic
 def _write(typing_context, counters, place, value):
-    """Set a counter; what this thread wrote before is seen by those that read it."""
+    """Set a counter; a thread that reads it sees all that this thread wrote before."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         builder.store_atomic(arguments[2], _pointer(context, builder, signature, arguments), "release", 8)
@@ -214,7 +214,7 @@ def _wait(counters, count):
         while done < count and _read(counters, _FLAGS + done) != 0:
             done += 1
         if done >= count:
-            # another thread may put less here: then what it has not seen is looked at again
+            # another thread may write a smaller number here: some flags are then read again
             _write(counters, _DONE, done)
             return _read(counters, _FAILED) == 0
         if _read(counters, _FAILED) != 0:
@@ -238,6 +238,6 @@ def first_task(tasks, counters):
 
 @inner
 def next_task(tasks, counters, k):
-    """Say that task k is done, and take another one, as `first_task` does."""
+    """Mark task k as done, and take another task, as `first_task` does."""
     _write(counters, _FLAGS + k, 1)  # type: ignore[call-arg]
     return first_task(tasks, counters)

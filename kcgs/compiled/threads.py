@@ -11,7 +11,7 @@ from typing import Concatenate, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
-# of an image: above it torch's operations gain more from threads than their waiting costs
+# pixels of an image: above this number torch's operations gain more from threads than waiting costs
 _MAX_PIXELS = 1 << 21
 
 P = ParamSpec("P")
@@ -21,7 +21,7 @@ _num_threads: ContextVar[int | None] = ContextVar("threads of the kernels", defa
 
 
 def num_threads() -> int:
-    """Return torch's number of threads, or its number outside of `threads_for_kernels`."""
+    """Return torch's number of threads; within `threads_for_kernels`, the number that torch had outside."""
     return _num_threads.get() or torch.get_num_threads()
 
 
@@ -29,7 +29,7 @@ def num_threads() -> int:
 def threads_for_kernels(pixels: int) -> Iterator[None]:
     """Give all threads to the kernels and one to torch; on an image of over two million pixels torch keeps its own.
 
-    Torch's threads wait for each other by spinning. Where other programs run beside it, waiting takes ten times as
+    Torch's threads wait for each other by spinning. Where other programs run on the machine, waiting takes ten times as
     long as short operations themselves.
     """
     before = torch.get_num_threads()

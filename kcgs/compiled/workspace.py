@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 
 _ALIGNMENT = 64
-# of a new block, over what was needed: a fit that adds Gaussians needs a little more from call to call
+# size of a new block over the size that was needed: a fit that adds Gaussians needs a little more from call to call
 _GROWTH = 1.25
 
 
 class Workspace:
     """Memory for the arrays of one call; a later call of the same Python thread takes it over, one at a time.
 
-    The C library may return what is freed to the system, which clears each page when it is used again: up to 4 ms per
+    The C library may return freed memory to the system, which clears each page when it is used again: up to 4 ms per
     render. An array must not be used after its workspace is gone.
     """
 
@@ -48,7 +48,7 @@ class Workspace:
 
     @contextmanager
     def rest(self) -> Iterator[Workspace]:
-        """Lend the memory behind the arrays so far, to one borrower at a time; others get a workspace of their own."""
+        """Lend the memory behind the present arrays to one borrower at a time; others get their own workspace."""
         if not self._is_lent.acquire(blocking=False):
             yield Workspace()
             return
@@ -61,9 +61,9 @@ class Workspace:
 
 
 def borrowed(array: Any) -> Any:
-    """Return a view of a contiguous array, for `run_tasks`, that does not keep its memory.
+    """Return a view of a contiguous array, for `run_tasks`, that does not keep its memory alive.
 
-    A thread holds what it was given a moment longer than it works on it: the caller's next array would be new memory.
+    A thread holds its arguments a moment longer than it works on them: the caller's next array would get new memory.
     """
     if array.nbytes == 0:
         return array
