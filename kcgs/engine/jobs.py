@@ -40,18 +40,18 @@ def run_jobs(
 ) -> Iterator[tuple[int, Result]]:
     """Run independent jobs, and yield the index and the result of each as it ends.
 
-    Convention: an exception in a job ends the iteration, so a job that may fail returns its error, and writes what it
-    makes to disk. Every job runs on `threads` threads, so that it has the same result on either engine. With more than
+    Convention: an exception in a job ends the iteration, so a job that may fail returns its error, and writes its
+    output to disk. Every job runs on `threads` threads, so that it has the same result on either engine. With more than
     one worker, and on Ray, functions, jobs and results are pickled, and a script must guard its main part by
     ``if __name__ == "__main__":``.
 
     Args:
         function: called with one job; importable by name where there are worker processes.
         jobs: the arguments of the calls.
-        engine: ``local``, or ``ray``: on the cluster at RAY_ADDRESS, or one on this machine that is shut down again.
-        workers: jobs at a time. None: 1 locally, on Ray what its processors allow. With 1, ``local`` is this process.
-        threads: of each job.
-        gpus: of each job, on Ray, which hands them out; a local job chooses its own.
+        engine: ``local``; or ``ray``: on the cluster at RAY_ADDRESS, or on one of this machine, shut down at the end.
+        workers: jobs at a time. None: 1 locally, on Ray as many as fit. With 1, ``local`` runs in this process.
+        threads: number of threads of each job.
+        gpus: number of GPUs of each job on Ray, which assigns them; a local job chooses its own.
 
     Returns:
         An iterator over all jobs in the order in which they end. The first job starts with the first `next`.
@@ -105,7 +105,7 @@ def _in_worker_processes(
     with ProcessPoolExecutor(workers, context, _start_worker, (threads,)) as pool:
         try:
             while True:
-                # at most one job per worker is submitted: what waits inside a pool cannot be cancelled
+                # at most one job per worker is submitted: jobs that wait inside a pool cannot be cancelled
                 for index, job in islice(queue, workers - len(running)):
                     running[pool.submit(function, job)] = index
                 if not running:
