@@ -1,4 +1,4 @@
-"""The text of the page: the element's script, a policy that allows that script only, and the scene."""
+"""The text of the page: two scripts, a policy that allows only these scripts, and the scene."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from kcgs.scene import Scene, check_scene
 _FOLDER = Path(__file__).resolve().parent
 ELEMENT = _FOLDER / "kcgs-image.js"
 """The script of `<kcgs-image>`, one file to copy to a site."""
-# PSNR in dB against the scene's own render: no value differs by a level of 255
+# PSNR in dB against the scene's own render: no value differs by as much as 1 / 255
 _QUALITY = 60.0
 
 
@@ -30,7 +30,7 @@ def scene_page(scene: Scene | bytes, *, title: str = "scene") -> str:
         title: title of the page and alternative text of the image.
 
     Returns:
-        The page, about 100 kB and 4/3 of the scene's file.
+        The page: about 100 kB plus 4/3 of the bytes of the scene's file.
 
     Raises:
         TypeError, ValueError: as :func:`kcgs.codec.encode` and :func:`kcgs.codec.decode`; another number of
@@ -55,7 +55,7 @@ def scene_page(scene: Scene | bytes, *, title: str = "scene") -> str:
 
 
 def web_bytes(scene: Scene | bytes) -> bytes:
-    """Encode a scene for a page, within a level of 255 of its own render; bytes of a file are checked and returned."""
+    """Encode a scene for a page, within 1 / 255 of its own render; bytes of a file are checked and returned."""
     loaded = check_scene(scene) if isinstance(scene, Scene) else decode(scene).scene
     channels = loaded.field.colors.shape[-1]
     if channels not in (1, 3, 4):

@@ -11,13 +11,13 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 def serve(page: str, *, port: int = 0, browser: bool = True, say: Callable[[str], object] = print) -> None:
     """Serve a page on loopback until Ctrl-C.
 
-    `port` 0 is any that is free; `browser` opens a window, `say` takes the line with the page's address.
+    `port` 0 is any free port; `browser` opens a window; `say` takes the line with the page's address.
     """
     content = page.encode()
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            # a site whose name leads to this machine may not read the scene
+            # a site whose name resolves to this machine must not read the scene
             if self.headers.get("Host", "").partition(":")[0] not in ("127.0.0.1", "localhost"):
                 return self.send_error(403, "only this machine's own address")
             if self.path != "/":
@@ -31,7 +31,7 @@ def serve(page: str, *, port: int = 0, browser: bool = True, say: Callable[[str]
                 self.wfile.write(content)
 
         def log_message(self, format: str, *args: object) -> None:
-            """Requests are not logged."""
+            """Log no requests."""
 
     with ThreadingHTTPServer(("127.0.0.1", port), Handler) as server:
         url = f"http://127.0.0.1:{server.server_address[1]}/"
