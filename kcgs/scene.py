@@ -44,11 +44,11 @@ class Scene(nn.Module):
         field: N Gaussians, or a batch of them.
         regions: a RegionMap, or a label map, integer or bool, Tensor or numpy array, :math:`(H, W)` or
             :math:`(B, H, W)`, with hard contours, of the field's size; None: nothing is confined.
-        metadata: notes of the user's, str to str, which .safetensors files keep.
+        metadata: notes of the user, str to str, which .safetensors files keep.
 
     Raises:
-        TypeError, ValueError: an argument of the wrong type; no label map; a map of another size, or a batch of maps
-            that are not one for each image.
+        TypeError, ValueError: an argument of the wrong type; no label map; a map of another size; a batch with another
+            number of maps than images.
 
     Example:
         >>> labels = (torch.arange(48) >= 24).long().expand(32, 48)
@@ -111,7 +111,7 @@ class Scene(nn.Module):
             return image.clamp(0.0, 1.0)
 
     def __len__(self) -> int:
-        """Number of images of a batch; TypeError for a scene of one image."""
+        """Return the number of images of a batch; TypeError for a scene of one image."""
         if self.num_images is None:
             raise TypeError("a scene of one image has no len; num_gaussians is the number of its Gaussians")
         return self.num_images
@@ -187,11 +187,11 @@ class Scene(nn.Module):
         return png(self.render((max(1, round(self.size[0] * factor)), max(1, round(self.size[1] * factor)))))
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Map and metadata, for `state_dict`."""
+        """Return map and metadata, for `state_dict`."""
         return {"regions": None if self.regions is None else self.regions.state(), "metadata": self.metadata}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Map and metadata, from `load_state_dict`."""
+        """Set map and metadata, from `load_state_dict`."""
         regions = state["regions"]
         self.regions = None if regions is None else RegionMap.from_state(regions)
         # a field on the device "meta" gets its tensors, and their device, later
@@ -241,7 +241,7 @@ def check_scene(scene: object, name: str = "scene") -> Scene:
     """Return `scene` if it is a Scene of one image, with one map and region ids, or without a map."""
     scene = check_unbatched(scene, name)
     field, regions = scene.field, scene.regions
-    _check_regions(field, regions)  # again, for either attribute may have been assigned
+    _check_regions(field, regions)  # checked again, since either attribute may have been assigned
     if regions is not None and regions.num_maps is not None:
         raise ValueError(f"{name} must have one map; got a batch of {regions.num_maps}")
     if regions is not None and field.region_ids is None:
