@@ -25,7 +25,7 @@ def check_writable(name: str, path: str | os.PathLike[str]) -> None:
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary path beside `path`, of the same suffix; the file written there takes its place at the end.
+    """Yield a temporary path beside `path`, of the same suffix; at the end the file written there replaces `path`.
 
     On any exception, Ctrl-C included, the temporary file is removed, and a file that stood at `path` stays.
     """

@@ -15,7 +15,7 @@ from kcgs.errors import InvalidArgument, InvalidArgumentType
 
 _FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 _INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64, torch.uint16, torch.uint32)
-# whole numbers of Python, and those that a graph leaves open
+# Python's whole numbers, and sizes that a graph leaves open
 _WHOLE = int, torch.SymInt
 
 
@@ -39,7 +39,7 @@ def check_tensor(name: str, value: object, dims: Sequence[int] = ()) -> Tensor:
 def check_floating(
     name: str, value: object, last: int | None = None, dims: Sequence[int] = (), finite: bool = True
 ) -> Tensor:
-    """Return `value` if it is a real floating tensor of an allowed rank and last dimension; `finite`: and finite."""
+    """Return `value` if it is a real floating tensor of an allowed rank and last dimension, and, if asked, finite."""
     tensor = check_tensor(name, value, dims)
     if tensor.dtype not in _FLOATS:
         raise InvalidArgumentType(name, "a real floating dtype", tensor.dtype, verb="have")
@@ -51,7 +51,7 @@ def check_floating(
 
 
 def verify(condition: Tensor, message: str) -> bool:
-    """Return whether `condition` is true; in a graph and on CUDA, True, and an assertion without a host sync."""
+    """Return whether `condition` is true; in a graph and on CUDA, assert it without a host sync, and return True."""
     try:
         assert_async(condition, message)
     except RuntimeError:
@@ -81,7 +81,7 @@ def check_rows(name: str, value: Tensor, means: Tensor, last: int | str) -> None
 
 
 def check_ids(name: str, value: object, means: Tensor, values: bool = True) -> Tensor:
-    """Return region ids as int64 if they are integers, one for each mean; `values`: and none is negative."""
+    """Return region ids as int64 if they are integers, one for each mean; with `values`, none may be negative."""
     tensor = check_integer(name, value)
     if tensor.shape != means.shape[:-1]:
         raise InvalidArgument(name, f"shape {tuple(means.shape[:-1])}", tuple(tensor.shape), verb="have")
@@ -149,7 +149,7 @@ def check_size(name: str, value: object) -> tuple[int, int]:
     """Return (height, width) if both are whole numbers of at least 1."""
     if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 2:
         raise InvalidArgumentType(name, "a pair (height, width)", repr(value))
-    # of a side that a graph leaves open, hasattr cannot be traced and operator.index would make a constant
+    # for a side that a graph leaves open, hasattr cannot be traced, and operator.index would make it a constant
     plain = [isinstance(side, _WHOLE) for side in value]
     integers = [known or hasattr(side, "__index__") for known, side in zip(plain, value, strict=True)]
     if not all(integers) or any(isinstance(side, bool) for side in value):

@@ -18,7 +18,7 @@ from kcgs._rows import row_slices
 
 Array = NDArray[Any]
 
-# tifffile logs the defects of a file, too, which the error names already
+# tifffile also logs the defects of a file, which the error names already
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -45,12 +45,12 @@ def read_size(path: str | os.PathLike[str]) -> tuple[int, int] | None:
         with Image.open(path) as image:
             width, height = image.size
             return (width, height) if _orientation(image) >= 5 else (height, width)
-    except Exception:  # whoever reads the pixels says why
+    except Exception:  # reading the pixels raises the error with its cause
         return None
 
 
 def _orientation(image: Image.Image) -> int:
-    """Return the orientation in EXIF; that of a TIFF is applied already."""
+    """Return the orientation in EXIF; 1 for a TIFF, which Pillow has turned already."""
     return 1 if image.format == "TIFF" else image.getexif().get(_ORIENTATION, 1)
 
 
@@ -115,7 +115,7 @@ def pil_samples(image: Any) -> NDArray[Any]:
 
 
 def pil_indices(image: Any) -> Array:
-    """Return `pil_samples`, but the indices of a palette image, and grey of more than 8 bits as it is stored."""
+    """Return `pil_samples`, but a palette image as its indices, and grey of more than 8 bits as it is stored."""
     if image.mode in ("1", "P") or image.mode.startswith("I"):
         values = np.asarray(image)[..., None]
         return values.astype(np.uint8) if image.mode == "1" else values
@@ -123,7 +123,7 @@ def pil_indices(image: Any) -> Array:
 
 
 def _tiff(data: bytes) -> Samples | None:
-    """Decode a grey or RGB TIFF of more than 8 bits or of floats; None: any other, which Pillow reads."""
+    """Decode a grey or RGB TIFF of more than 8 bits or of floats; return None for others, which Pillow reads."""
     import tifffile
     from tifffile import EXTRASAMPLE, PHOTOMETRIC
 

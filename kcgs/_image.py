@@ -1,4 +1,4 @@
-"""Images as people have them, tensors, numpy arrays, PIL images and files, as one tensor."""
+"""Conversion of images, be they tensors, numpy arrays, PIL images or files, to one tensor."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LUMA = (0.299, 0.587, 0.114)
 def as_image(
     name: str, value: object, tolerance: float = 0.0, keep_alpha: bool = False, keep_batch: bool = False
 ) -> Tensor:
-    """Return an image as a tensor (C, H, W) in [0, 1], which its values may pass by `tolerance`.
+    """Return an image as a tensor (C, H, W) in [0, 1]; values may exceed this range by `tolerance`.
 
     An image is a Tensor (C, H, W) or (1, C, H, W), whose channels are taken as they are; a numpy array (H, W, C) or
     (H, W) of uint8, uint16 or floats in [0, 1]; a PIL image; or a path, as `kcgs.data.load_image` reads it. Arrays of
@@ -43,7 +43,7 @@ def as_image(
     elif isinstance(value, Tensor):
         if value.dtype == torch.uint8:
             raise InvalidArgumentType(name, "floating, in [0, 1]", f"{value.dtype}: pass {name} / 255")
-        image = check_floating(name, value, dims=(3, 4), finite=False)  # which is checked below
+        image = check_floating(name, value, dims=(3, 4), finite=False)  # checked below
     elif isinstance(value, str | os.PathLike):
         return read_image(value)
     else:
@@ -102,7 +102,7 @@ def read_image(path: str | os.PathLike[str], channels: str = "RGB") -> Tensor:
         warn_user(f"{path} holds {samples.frames} images: the first is read")
     values, white = samples.values, samples.white
     if values.dtype.kind == "f":
-        values = np.require(values, np.float32, ["C", "W"])  # Pillow's are read-only
+        values = np.require(values, np.float32, ["C", "W"])  # Pillow's arrays are read-only
         as_image(str(path), torch.from_numpy(values.transpose(2, 0, 1)))
     if channels != "RGBA" and values.shape[-1] in (2, 4) and values[..., -1].min() < white:
         _warn_of_alpha(str(path))
@@ -121,7 +121,7 @@ def _planes(values: NDArray[Any], white: float) -> NDArray[Any]:
 
 
 def _with_channels(image: NDArray[Any], channels: str) -> NDArray[Any]:
-    """Return an image of 1 to 4 channels as "RGB", "L" or "RGBA"; grey has one channel as "RGB", too."""
+    """Return an image of 1 to 4 channels as "RGB", "L" or "RGBA"; as "RGB", grey keeps its one channel."""
     if channels == "RGBA":
         color, alpha = (image[:-1], image[-1:]) if len(image) in (2, 4) else (image, np.ones_like(image[:1]))
         return np.concatenate([np.broadcast_to(color, (3, *color.shape[1:])), alpha])
@@ -138,7 +138,7 @@ def _warn_of_alpha(name: str) -> None:
 
 
 def _on_white(image: NDArray[Any]) -> NDArray[Any]:
-    """Compose an image with alpha, (2, H, W) or (4, H, W), on white; return others as they are."""
+    """Compose an image with alpha, (2, H, W) or (4, H, W), on white; return other images unchanged."""
     if len(image) not in (2, 4):
         return image
     color, alpha = image[:-1], image[-1:]

@@ -1,4 +1,4 @@
-"""Label maps as people have them, tensors, numpy arrays, PIL images and files, as one tensor."""
+"""Conversion of label maps, be they tensors, numpy arrays, PIL images or files, to one tensor."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from kcgs.errors import InvalidArgument, InvalidArgumentType
 MAX_COLORS = 4096
 """An image with more distinct colours is taken for a photo, not for a label map."""
 
-# In a mask with soft edges the darkest and the lightest levels, each this share of the range,
+# a mask with soft edges is known by its grey levels: this share of their range at either end counts as dark or light
 _END_SHARE = 1 / 16
-# cover so much of it,
+# least share of pixels of such a mask that are dark or light
 _MIN_SHARE = 0.5
-# there are at least so many levels between them,
+# least number of levels of such a mask between dark and light
 _MIN_LEVELS = 8
-# and so few of the pixels between have eight neighbours of their own level.
+# of the pixels between dark and light, largest share whose eight neighbours have their own level
 _MAX_INTERIOR = 0.05
 
 
@@ -36,10 +36,10 @@ def is_label_source(value: object) -> bool:
 
 
 def check_labels(name: str, value: object, dims: Sequence[int] = (2, 3), values: bool = True) -> Tensor:
-    """Return a label map as int64; `values`: and no id is negative.
+    """Return a label map as int64; with `values`, no id may be negative.
 
-    A map is a tensor or a numpy array, a PIL image, or a path: see `kcgs.data.load_labels`. Arrays are of integers or
-    bool, or as Kornia's augmentations return them, floating and (B, 1, H, W), which is returned without the 1.
+    A map is a tensor or a numpy array, a PIL image, or a path: see `kcgs.data.load_labels`. Arrays hold integers, bool
+    or floating whole numbers; (B, 1, H, W), as Kornia's augmentations return it, is returned as (B, H, W).
     """
     if isinstance(value, Tensor):
         value = _from_tensor(name, value)
@@ -71,7 +71,7 @@ def _from_tensor(name: str, value: Tensor) -> Tensor:
     """Return integers as they are, and bool or floating whole numbers as int64."""
     if not value.is_floating_point():
         return value.long() if value.dtype == torch.bool else value
-    # neither NaN nor beyond int64; on CUDA, too, the host waits: labels are made ready once
+    # false for NaN and beyond int64; on CUDA, too, the host waits, since labels are prepared once
     is_whole = (value.detach() % 1 == 0) & (value.detach().abs() < 2.0**63)
     if value.is_cpu or torch.compiler.is_compiling():
         is_valid = verify(is_whole.all(), f"{name} must hold whole numbers")
@@ -89,7 +89,7 @@ def read_labels(path: str | os.PathLike[str], rgb_ids: bool = False, threshold: 
     remedy = f"load_labels({os.fspath(path)!r}, threshold={{0}}), or --threshold {{0}}"
     if Path(path).suffix.lower() == ".npy":
         try:
-            values = np.asarray(np.load(path, allow_pickle=False))  # of an archive an object, which is no map
+            values = np.asarray(np.load(path, allow_pickle=False))  # an archive becomes an object, which is no map
         except (ValueError, EOFError) as error:
             raise ValueError(f"cannot read {path} as an .npy array: {error}") from error
         return _from_grey(str(path), values, remedy, threshold)
@@ -181,7 +181,7 @@ def _from_colors(values: NDArray[Any], path: str | os.PathLike[str]) -> Tensor:
 
 
 def _pack(values: NDArray[Any]) -> NDArray[Any]:
-    """Return colours (H, W, C) as numbers in the order of R, then G, B and A; 0 for transparent ones."""
+    """Return colours (H, W, C) as numbers in the order of R, then G, B and A; 0 for transparent colours."""
     bits, dtype = (8, np.uint32) if values.dtype == np.uint8 else (16, np.uint64)
     packed = np.zeros(values.shape[:2], dtype)
     for channel in range(values.shape[-1]):
@@ -193,13 +193,13 @@ def _pack(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _sort_distinct(numbers: NDArray[Any]) -> NDArray[Any]:
-    """Return the distinct ones of numbers, sorted; the numbers are sorted in place."""
+    """Return the distinct numbers, sorted; `numbers` is sorted in place."""
     numbers.sort()
     return np.concatenate([numbers[:1], numbers[1:][numbers[1:] != numbers[:-1]]])
 
 
 def _check_edges(name: str, levels: NDArray[Any], remedy: str) -> None:
-    """Refuse grey levels between dark and light ones that occur along contours only.
+    """Refuse a mask with soft edges: levels between dark and light that occur along contours only.
 
     Args:
         name: of the map.

@@ -1,4 +1,4 @@
-"""An error before the work begins, where images do not fit into memory."""
+"""Checks, before the work begins, that images fit into memory."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-# bytes that every machine is taken to have: the free memory is looked up for more only
+# bytes that every machine is assumed to have free: only for more, the free memory is looked up
 _SMALL = 1 << 26
 
 
@@ -29,7 +29,7 @@ def check_batch_memory(name: str, images: Tensor, per_image: float) -> None:
     if needed <= _SMALL:
         return
     free = free_memory()
-    if images.is_cuda:  # what torch keeps for later is free, too
+    if images.is_cuda:  # memory that torch keeps for later is free, too
         kept = torch.cuda.memory_reserved(images.device) - torch.cuda.memory_allocated(images.device)
         free = float(torch.cuda.mem_get_info(images.device)[0] + kept)
     if needed > free:
@@ -38,7 +38,7 @@ def check_batch_memory(name: str, images: Tensor, per_image: float) -> None:
 
 
 def free_memory() -> float:
-    """Return the bytes that are free, swap included, at most all that a container has; infinite where unknown."""
+    """Return the bytes that are free, swap included, at most a container's limit; infinite where unknown."""
     limits = [math.inf]
     with suppress(OSError):
         facts = dict(re.findall(r"(\w+): +(\d+) kB", Path("/proc/meminfo").read_text()))

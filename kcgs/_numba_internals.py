@@ -1,6 +1,6 @@
 """The private names of numba that kcgs uses.
 
-`tests/test_private_names.py` lists them with what breaks where numba has one no longer.
+`tests/test_private_names.py` lists each name, and what breaks if numba removes it.
 """
 
 from __future__ import annotations
@@ -14,22 +14,22 @@ from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
 from numba.misc.appdirs import AppDirs
 
-# for other modules: loops and variables of LLVM code; settings of the environment; the base of a cache of ours; the
-# cache folder of the user
+# for other modules: the user's cache folder; the base of kcgs' cache; loops and variables of LLVM code; settings of the
+# environment
 __all__ = ["AppDirs", "NullCache", "cgutils", "config", "from_bytes", "set_cache", "to_bytes"]
 
 
 def set_cache(dispatcher: Any, cache: NullCache) -> None:
-    """Keep what a function compiles to in a cache of ours."""
+    """Keep the compiled code of a function in a cache of kcgs."""
     dispatcher._cache = cache
 
 
 def to_bytes(result: Any) -> bytes:
-    """Return what a function has compiled to as a pickle."""
+    """Return the compiled code of a function as a pickle."""
     content: bytes = dumps(result._reduce())
     return content
 
 
 def from_bytes(context: Any, content: bytes) -> Any:
-    """Return what a function has compiled to from its pickle."""
+    """Return the compiled code of a function from its pickle."""
     return CompileResult._rebuild(context, *pickle.loads(content))

@@ -1,4 +1,4 @@
-"""The names of objectives, and which of them each purpose takes; without torch, for the command line reads them."""
+"""The names of objectives, and which names each purpose takes; without torch, since the command line reads them."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def check_objective(name: object) -> ObjectiveName | None:
 
 
 def objective_for(purpose: Purpose, name: ObjectiveName | None) -> ObjectiveName:
-    """Return the objective of a purpose, None for its default; refuse one that it cannot lower."""
+    """Return the objective `name` for a purpose, its default for None; refuse an objective that it does not take."""
     names = PURPOSES[purpose]
     if name is not None and name not in names:
         raise InvalidArgument("objective", f"{' or '.join(names)} for a {purpose}", repr(name))

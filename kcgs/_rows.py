@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-_PIXELS = 1 << 14  # of a slice: fits into a cache, and is too small for threads of torch, whose start would cost more
+_PIXELS = 1 << 14  # per slice: it fits into a cache, and torch starts no threads, which would cost more than they save
 
 
 def row_slices(height: int, width: int, pixels: int = _PIXELS) -> Iterator[slice]:

@@ -1,4 +1,4 @@
-"""Suffixes of files, for rooms that load torch and for the command line, which checks names before it does."""
+"""Suffixes of files, for rooms that load torch, and for the command line, which checks names before torch loads."""
 
 SCENES = (".safetensors", ".kcgs")
 

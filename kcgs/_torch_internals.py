@@ -1,6 +1,6 @@
 """The private names of torch that kcgs uses, each in one function that says what it is for.
 
-`tests/test_private_names.py` lists them with what breaks where torch has one no longer.
+`tests/test_private_names.py` lists each name, and what breaks if torch removes it.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ def unwrapped(tensor: Tensor) -> Tensor:
 
 
 def below_autograd(function: Any, *arguments: Any) -> Any:
-    """Call a function without autograd; else an operator that its own autograd kernel calls would call that again."""
+    """Call a function without autograd, so that an operator's own autograd kernel can call the operator."""
     with torch._C._AutoDispatchBelowAutograd():
         return function(*arguments)
 
 
 @contextmanager
 def with_autograd() -> Iterator[None]:
-    """Record a graph inside of an operator; else nothing would be, since operators are evaluated below autograd."""
+    """Record a graph inside of an operator, although operators are evaluated below autograd."""
     keys = torch._C.DispatchKey.AutogradFunctionality, torch._C.DispatchKey.ADInplaceOrView
     with ExitStack() as stack:
         for key in keys:
@@ -46,39 +46,39 @@ def with_autograd() -> Iterator[None]:
 
 
 def is_transforming() -> bool:
-    """True inside of `torch.func`; else a kernel would read the wrappers that vmap and jvp put around tensors."""
+    """Return whether `torch.func` is active: a kernel must not read the wrappers of tensors in vmap and jvp."""
     return bool(torch._C._are_functorch_transforms_active())
 
 
 def has_mode() -> bool:
-    """True under a mode, fake tensors or a counter of operations; else the mode would not see the operator."""
+    """Return whether a mode is active, such as fake tensors or a counter of operations: it must see the operator."""
     return bool(torch._C._len_torch_dispatch_stack())
 
 
 def is_batched_gradient(tensor: Tensor) -> bool:
-    """True for gradients of `is_grads_batched`, wrappers of an older kind; else a kernel would read them."""
+    """Return whether a gradient is an older wrapper, of `is_grads_batched`, which a kernel must not read."""
     return bool(is_legacy_batchedtensor(tensor))
 
 
 def is_forward_mode() -> bool:
-    """True inside of `forward_ad.dual_level`; else tensors that need no gradient would lose their tangents."""
+    """Return whether `forward_ad.dual_level` is active, where tensors that need no gradient may have tangents."""
     return forward_ad._current_level >= 0
 
 
 def forward_derivatives() -> Any:
-    """Take forward derivatives inside of the forward of an autograd.Function; else outer levels of `jvp` would be 0."""
+    """Take forward derivatives inside of an autograd.Function's forward; without them outer levels of `jvp` are 0."""
     return forward_ad._set_fwd_grad_enabled(True)
 
 
 def is_graph_retained() -> bool:
-    """True in a backward with `retain_graph`; else a loss that stays alive would hold the memory of a plan."""
+    """Return whether the present backward has `retain_graph`: if not, the memory of a plan is freed."""
     return bool(torch._C._autograd._get_current_graph_task_keep_graph())
 
 
 def apply(function: Any, *arguments: Any) -> Any:
-    """Apply an autograd.Function; else torch refuses one whose forward takes `ctx` inside of `torch.func`.
+    """Apply an autograd.Function whose forward takes `ctx`, which torch refuses inside of `torch.func`.
 
-    It may, since its forward calls an operator that transforms see.
+    It is safe there, since the forward calls an operator that transforms see.
     """
     if is_transforming():
         with enable_single_level_autograd_function():
@@ -87,8 +87,8 @@ def apply(function: Any, *arguments: Any) -> Any:
 
 
 def register_decomposition(operator: Any, function: Any, kind: str = "post_autograd") -> None:
-    """Give `torch.onnx.export` standard operators, or fake tensors of open sizes a shape (`kind` "meta").
+    """Register standard operators for `torch.onnx.export`, or, with `kind` "meta", a shape for open sizes.
 
-    Else the first has no translation of the operator, and the second decompose it.
+    Without the first, the export has no translation of the operator; without the second, fake tensors decompose it.
     """
     torch._decomp.register_decomposition(operator, type=kind)(function)

@@ -1,4 +1,4 @@
-"""Warnings that name the line of the user's which called kcgs, however deep they arise."""
+"""Warnings that name the user's line that called kcgs, however deep inside they arise."""
 
 from __future__ import annotations
 
