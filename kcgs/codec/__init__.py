@@ -7,5 +7,5 @@ from .rangecoder import CodecError
 from .region_map import encode_region_map
 from .scenes import QUALITIES, Decoded, SceneWriter, decode, encode
 
-# public; what else is imported here is for the other rooms of kcgs
+# the public names; other packages of kcgs use the other imports
 __all__ = ["CodecError", "Decoded", "decode", "decode_labels", "encode", "encode_labels"]

@@ -12,13 +12,13 @@ import numpy as np
 from .exact import Floats, Integers
 from .rangecoder import ONE, Coder
 
-_MIN_CHANCE = 64  # of an adaptive bit, in 1 / ONE
+_MIN_CHANCE = 64  # least chance of a value of an adaptive bit, in 1 / ONE
 
 # buckets of magnitudes
-_SINGLES = 16  # magnitudes below it have a bucket each
+_SINGLES = 16  # smaller magnitudes have a bucket each
 _FIRST_OCTAVE = 4  # log2 of the least magnitude that shares a bucket
 _LAST_OCTAVE = 24  # log2 of the least magnitude that is too large
-_PER_OCTAVE = 8  # buckets of equal width
+_PER_OCTAVE = 8  # buckets of equal width per octave
 _SHARED_LOW = [
     (1 << octave - 3) * eighth
     for octave in range(_FIRST_OCTAVE, _LAST_OCTAVE)
@@ -27,19 +27,19 @@ _SHARED_LOW = [
 _LOW = np.array([*range(_SINGLES), *_SHARED_LOW], np.int64)  # least magnitude of each bucket
 _HIGH = np.append(_LOW[1:], 1 << _LAST_OCTAVE)  # least magnitude above each bucket
 _BORDERS = np.maximum(np.append(_LOW, _HIGH[-1]) - 0.5, 0.0)  # halfway between magnitudes
-_FLOOR = 1e-3  # share of the weights that all buckets have in equal parts
+_FLOOR = 1e-3  # share of the total weight that is divided equally among the buckets
 
-# bins of the shape that all scales share
+# the shape that all scales share
 _BINS = 24
 _BIN_WIDTH = 0.125  # in scales
-_PARTS = 256  # of a magnitude that is spread over bins
+_PARTS = 256  # unit of the share of a magnitude in a bin: 1 / _PARTS
 _GROUP = 1 << 12  # magnitudes whose tables are in memory at a time
 
-_ANGLE_BINS = 16  # of half a turn
+_ANGLE_BINS = 16  # bins of half a turn
 
 
 class AdaptiveBit:
-    """A bit whose chance is learned; at first it is 1/2."""
+    """A bit whose chance is learned; the first chance is 1/2."""
 
     def __init__(self) -> None:
         self._ones = 2
@@ -55,7 +55,7 @@ class AdaptiveBit:
 
 
 class AdaptiveSymbol:
-    """One of a few symbols, with the weights that they have at first."""
+    """One of a few symbols, whose weights are learned; `weights` are the first ones."""
 
     def __init__(self, weights: Floats) -> None:
         self._weights = weights.copy()
@@ -68,7 +68,7 @@ class AdaptiveSymbol:
 
 
 class AdaptiveNumber:
-    """A number whose count of bits is learned; `weights` are those of 0 bits, 1, 2 and so on, at first."""
+    """A number whose count of bits is learned; `weights` are the first weights of the counts 0, 1, 2 and so on."""
 
     def __init__(self, weights: Floats) -> None:
         self._length = AdaptiveSymbol(weights)
@@ -81,9 +81,9 @@ class AdaptiveNumber:
 
 
 class AdaptiveMagnitude:
-    """Magnitudes 0, 1, 2 ... of known scales, by a shape over magnitude / scale that is learned for all scales.
+    """Magnitudes 0, 1, 2 ... of known scales; all scales share a learned distribution of magnitude / scale.
 
-    `shapes` [contexts, bins] has the weights of the bins at first; each context learns by itself.
+    `shapes` [contexts, bins] are the first weights of the bins; each context learns its own shape.
     """
 
     def __init__(self, shapes: Floats) -> None:
@@ -106,9 +106,9 @@ class AdaptiveMagnitude:
         return magnitudes
 
     def _tables(self, scale: float) -> Floats:
-        """Return the weights of the buckets, [contexts, buckets]: integrals of the shape, which is piecewise constant.
+        """Return the weights of the buckets, [contexts, buckets]: integrals of the piecewise constant shape.
 
-        Sums and interpolation are written out, since the order of numpy's own operations may differ.
+        Sums and interpolation are written out, since numpy may sum in another order.
         """
         total = np.array([list(itertools.accumulate(shape, initial=0.0)) for shape in self._shapes.tolist()])
         edges: Floats = np.arange(_BINS + 1.0) * (scale * _BIN_WIDTH)
@@ -120,7 +120,7 @@ class AdaptiveMagnitude:
         return tables
 
     def _spread(self, scale: float, context: Integers, magnitudes: Integers) -> Floats:
-        """Spread each magnitude over the bins that round to it, in whole parts, whose sums no order changes."""
+        """Spread each magnitude over the bins that round to it, in whole parts: their sums are exact in any order."""
         edges = np.arange(_BINS + 1) * (scale * _BIN_WIDTH)
         edges[-1] = np.inf
         num_contexts = len(self._shapes)
@@ -138,7 +138,7 @@ class AdaptiveMagnitude:
 
 
 class AdaptiveAngle:
-    """Angles, each one of so many in half a turn; `weights` are those of bins about 0, 1/16, 2/16 ... at first."""
+    """Angles in steps of half a turn; `weights` are the first weights of bins around 0, 1/16, 2/16 ... of it."""
 
     def __init__(self, weights: Floats) -> None:
         self._weights = weights.copy()
@@ -146,7 +146,7 @@ class AdaptiveAngle:
     def code(self, coder: Coder, num_angles: Integers, values: Integers) -> Integers:
         """Code angles (n,), each below its entry of `num_angles` (n,); only entries of 16 or more have bins."""
         has_bin = num_angles >= _ANGLE_BINS
-        # half a bin, so that angle 0 is in the middle of the first one
+        # half a bin: angle 0 is in the middle of the first bin
         shift = np.where(has_bin, num_angles // (2 * _ANGLE_BINS), 0)
         shifted = (values + shift) % num_angles
         counts, row = np.unique(num_angles[has_bin], return_inverse=True)

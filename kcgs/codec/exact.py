@@ -28,7 +28,7 @@ def exp2(x: Floats) -> Floats:
 
 
 def cos_sin(share: Floats) -> tuple[Floats, Floats]:
-    """Return cosine and sine of an angle in half turns, 0 to 1."""
+    """Return cosine and sine of an angle; 0 to 1 is half a turn."""
     angle = (share - 0.5) * math.pi
     square = angle * angle
     return -angle * _polynomial(_SIN, square), _polynomial(_COS, square)

@@ -19,26 +19,26 @@ MAX_CHANNELS = 1 << 10
 MAX_REGIONS = (1 << 24) - 1
 MAX_LABELS = 1 << 26  # pixels of a label map
 MAX_GAUSSIANS = (1 << 21) - 1
-MAX_COLORS = 1 << 27  # numbers of colours: Gaussians times channels
+MAX_COLORS = 1 << 27  # values of all colours: Gaussians times channels
 _MAX_LAYERS = 128
-_MAX_BYTES = 1 << 32  # of a map or a layer
-_VARINT_BITS = 35  # of five bytes
+_MAX_BYTES = 1 << 32  # largest size of a map or a layer
+_VARINT_BITS = 35  # bits of the longest varint, five bytes
 _HEADER_CRC = 4  # bytes
 LAYER_CRC = 2  # bytes
 
 
 class Header(NamedTuple):
-    """What a file says before its content."""
+    """The numbers at the start of a file."""
 
     size: tuple[int, int]
     channels: int
     qp: int  # quantization parameter
     regions: int = 1
-    layers: tuple[tuple[int, int], ...] = ()  # highest energy, bytes
+    layers: tuple[tuple[int, int], ...] = ()  # of each layer: highest class of energy, bytes
 
 
 def max_gaussians(channels: int) -> int:
-    """Return how many Gaussians a file may hold."""
+    """Return the largest number of Gaussians in a file."""
     return min(MAX_GAUSSIANS, MAX_COLORS // channels)
 
 
@@ -59,7 +59,7 @@ def pack(header: Header, region_map: bytes, layers: list[bytes]) -> bytes:
 
 
 def varint(value: int) -> bytes:
-    """Return a number, 0 or more, in seven bits per byte, low ones first."""
+    """Return a number, 0 or more, in seven bits per byte, the low bits first."""
     data = bytearray()
     while value > 127:
         data.append(value & 127 | 128)
@@ -68,7 +68,7 @@ def varint(value: int) -> bytes:
 
 
 def unpack(data: bytes) -> tuple[Header, bytes, list[bytes]]:
-    """Split a file into its header, its map, and the layers that are whole."""
+    """Split a file into its header, its map, and its complete layers."""
     reader = ByteReader(data)
     header, map_length = _read_header(reader)
     head = reader.data[: reader.position]
@@ -124,7 +124,7 @@ def _read_layers(reader: ByteReader, header: Header) -> Iterator[bytes]:
 
 
 class ByteReader:
-    """Reads bytes and varints from the front, never beyond the end."""
+    """Read bytes and varints from the front, never beyond the end."""
 
     def __init__(self, data: bytes) -> None:
         self.data, self.position = data, 0

@@ -1,4 +1,4 @@
-"""Label maps as files of their own, without loss (docs/format.md, "A file of a label map")."""
+"""Lossless files of label maps (docs/format.md, "A file of a label map")."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from .rangecoder import CodecError
 _TYPES = ("bool", "uint8", "int8", "uint16", "int16", "uint32", "int32", "int64")
 _CRC = 4  # bytes
 _TURNS = 8  # ways to transpose and mirror a map
-_TRIED_TURNS = 2  # of which the smallest is written
-_SEED_MARGIN = 3  # seeds by which a turn that is tried may exceed the fewest
+_TRIED_TURNS = 2  # turns that are coded; the smallest stream is written
+_SEED_MARGIN = 3  # a turn is coded only if it has at most so many seeds more than the best turn
 
 
 def encode_labels(labels: Tensor | NDArray[Any]) -> bytes:
     """Write a label map as a `.kcgs` file; nothing is lost, and the same map gives the same bytes.
 
     Args:
-        labels: :math:`(H, W)` integer or bool, Tensor or numpy array, ids of 0 to 2**63 - 1. At most 2**26 pixels,
-            2**20 on a side, and fewer than 2**24 regions.
+        labels: :math:`(H, W)` integer or bool, Tensor or numpy array, ids from 0 to 2**63 - 1. A file holds at most
+            2**26 pixels, 2**20 pixels on a side, and fewer than 2**24 regions.
 
     Returns:
         The file. A photo's segmentation takes a few hundred bytes.
@@ -60,11 +60,11 @@ def encode_labels(labels: Tensor | NDArray[Any]) -> bytes:
 
 
 def _encode_smallest(ids: Integers, index: NDArray[Any]) -> tuple[int, bytes]:
-    """Write the stream of a map, turned so that it takes few bytes; return the turn, too."""
+    """Return the turn of a map that takes the fewest bytes of those tried, and its stream."""
     from .labels.stream import encode_stream  # loads numba
     from .labels.wavefront import number_regions
 
-    # the fewer seeds, the smaller the stream, as a rule
+    # as a rule, a turn with fewer seeds has a smaller stream
     seeds = [int(number_regions(turned(index, turn), len(ids))[1].sum()) for turn in range(_TURNS)]
     fewest = sorted(range(_TURNS), key=seeds.__getitem__)[:_TRIED_TURNS]
     turns = [turn for turn in fewest if seeds[turn] <= min(seeds) + _SEED_MARGIN]
@@ -73,13 +73,13 @@ def _encode_smallest(ids: Integers, index: NDArray[Any]) -> tuple[int, bytes]:
 
 
 def turned(labels: NDArray[Any], turn: int) -> NDArray[Any]:
-    """Transpose a map if `turn` has the bit 4, reverse its rows if it has 2, then its columns if it has 1."""
+    """Transpose a map if `turn` has bit 4, reverse its rows for bit 2, then its columns for bit 1."""
     labels = labels.T if turn & 4 else labels
     return np.ascontiguousarray(labels[:: -1 if turn & 2 else 1, :: -1 if turn & 1 else 1])
 
 
 def turned_back(labels: NDArray[Any], turn: int) -> NDArray[Any]:
-    """Return a view of the map that `turned` was given."""
+    """Undo `turned`: return a view of the original map."""
     labels = labels[:: -1 if turn & 2 else 1, :: -1 if turn & 1 else 1]
     return labels.T if turn & 4 else labels
 
@@ -91,7 +91,7 @@ def decode_labels(data: bytes) -> Tensor:
         data: the whole file.
 
     Returns:
-        :math:`(H, W)` on the CPU, in the dtype that was encoded; of uint64, int64.
+        :math:`(H, W)` on the CPU, in the dtype that was encoded; int64 for uint64.
 
     Raises:
         TypeError: ``data`` is no bytes.

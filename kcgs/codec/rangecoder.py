@@ -1,6 +1,6 @@
-"""constriction's range coder behind two classes, so that one procedure describes both writing and reading.
+"""The range coder of constriction behind two classes, so that one procedure describes both writing and reading.
 
-The symbols and how they share a stream are specified in docs/format.md.
+docs/format.md specifies the symbols of a stream.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ import numpy as np
 from .exact import Floats, Integers
 
 ONE = 1 << 16  # a chance of 1: chances are whole multiples of 1 / ONE
-_STATE_BITS = 64  # of the coder
+_STATE_BITS = 64  # bits of the coder's state
 _DIGIT = 1 << 16  # largest alphabet of `number`: larger numbers are coded in parts
 _LAZY_SIZE = 16  # alphabet below which constriction is faster by search than by a table
 
 
 class CodecError(ValueError):
-    """A stream that is damaged, or no stream of this format."""
+    """A stream is damaged, or is not of this format."""
 
 
 class Coder(ABC):
-    """Either side of a stream: a writer takes values and returns them, a reader ignores them and returns its own.
+    """One side of a stream: a writer codes values and returns them, a reader ignores them and returns decoded values.
 
-    So one procedure writes and reads; a reader's values are any of the right shape.
+    So one procedure both writes and reads; a reader passes any values of the right shape.
     """
 
     is_reader = False
@@ -39,21 +39,21 @@ class Coder(ABC):
 
     @abstractmethod
     def _code(self, values: Any, model: Any, *parameters: Any, count: int | None = None) -> Any:
-        """Code by a model: one value, or one for each entry of the parameters, or `count` of them."""
+        """Code by a model: one value, or a value for each entry of the parameters, or `count` values."""
 
     def bits(self, chances: Any, values: Any) -> Any:
         """Code bits (n,) int32 that are 1 with these chances (n,), float64 in whole 1 / ONE."""
         return self._code(values, self._bernoulli, chances)
 
     def number(self, value: int, size: int) -> int:
-        """Code a number below `size`: what exceeds 16 bits, then 16 bits."""
+        """Code a number below `size`: the bits above the low 16, then the low 16."""
         if size > _DIGIT:
             high = self.number(value >> 16, -(-size >> 16))
             return high << 16 | self.number(value & (_DIGIT - 1), _DIGIT)
         return int(self._code(value, self._models.Uniform(size))) if size > 1 else 0
 
     def fair_bit(self, value: bool) -> bool:
-        """Code a bit that is as likely 0 as 1."""
+        """Code a bit that is 0 or 1 with equal chances."""
         return bool(self.number(int(value), 2))
 
     def plain_bits(self, value: int, count: int) -> int:
@@ -65,7 +65,7 @@ class Coder(ABC):
         return result
 
     def unbounded_number(self, value: int) -> int:
-        """Code a number below 2**63: its count of bits, then those below the highest."""
+        """Code a number below 2**63: its count of bits, then the bits below the highest."""
         length = self.number(value.bit_length(), 64)
         return 1 << (length - 1) | self.plain_bits(value, length - 1) if length else 0
 
@@ -76,7 +76,7 @@ class Coder(ABC):
     def uniform(self, sizes: Integers, values: Integers) -> Integers:
         """Code values (n,), each below its entry of `sizes` (n,), which is 1 to 2**24 - 1."""
         coded = np.zeros(len(sizes), np.int64)
-        index = np.flatnonzero(sizes > 1)  # constriction has no alphabet of one
+        index = np.flatnonzero(sizes > 1)  # constriction has no alphabet of one symbol
         if len(index):
             numbers, model = values[index].astype(np.int32), self._models.Uniform()
             coded[index] = self._code(numbers, model, sizes[index].astype(np.int32))
@@ -90,7 +90,7 @@ class Coder(ABC):
         return np.asarray(symbols, np.int64)
 
     def mixed_categorical(self, tables: Floats, rows: Integers, values: Integers) -> Integers:
-        """Code values (n,), each by the row of `tables` (T, A) that its entry of `rows` (n,) names."""
+        """Code values (n,), each with the row of `tables` (T, A) at its entry of `rows` (n,)."""
         if len(tables) == 1:
             return self.categorical(tables[0], values)
         # one by one: constriction would build a model for each value
@@ -103,7 +103,7 @@ class Coder(ABC):
 
 
 class Writer(Coder):
-    """Turns symbols into bytes."""
+    """Turn symbols into bytes."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -114,12 +114,12 @@ class Writer(Coder):
         return values
 
     def finish(self) -> bytes:
-        """Return the fewest bytes that, with zeros behind them, read as the symbols."""
+        """Return the fewest bytes that a reader, which sees zeros after them, decodes to the symbols."""
         position, (lower, width) = self._encoder.pos()
         length = 4 * position + _STATE_BITS // 8
         words: bytes = self._encoder.get_compressed().astype(">u4").tobytes()
         value = int.from_bytes(words[:length].ljust(length, b"\0"), "big")
-        # all values from `low` to below `low + width` read the same; constriction chose `value`
+        # all values from `low` to below `low + width` decode to the same symbols; constriction chose `value`
         low = value - ((value - lower) % (1 << _STATE_BITS))
         # the width is below 2**64: rstrip removes zeros beyond 8
         for zeros in range(min(length, _STATE_BITS // 8), -1, -1):
@@ -131,7 +131,7 @@ class Writer(Coder):
 
 
 class Reader(Coder):
-    """Turns bytes into symbols; zeros follow the last byte."""
+    """Turn bytes into symbols; zeros follow the last byte."""
 
     is_reader = True
 

@@ -16,13 +16,13 @@ from .exact import Integers
 from .file import MAX_LABELS, MAX_REGIONS, ByteReader, varint
 from .rangecoder import CodecError, Coder, Reader, Writer
 
-_UNITS = 40  # of softness, per pixel
+_UNITS = 40  # units of softness per pixel
 _MAX_UNITS = int(MAX_SOFTNESS) * _UNITS
-_GROUP = 32  # pairs that are coded before their model learns
+_GROUP = 32  # pairs between two updates of the model
 
 
 def encode_region_map(regions: RegionMap) -> bytes:
-    """Write a map of two regions or more; softness is rounded to fortieths of a pixel."""
+    """Write a map of two or more regions; softness is rounded to fortieths of a pixel."""
     from .labels.stream import encode_stream  # loads numba
 
     if regions.is_resampled:

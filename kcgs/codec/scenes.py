@@ -1,4 +1,4 @@
-"""Scenes as `.kcgs` bytes, and back."""
+"""Write scenes as `.kcgs` files, and read them."""
 
 from __future__ import annotations
 
@@ -28,26 +28,27 @@ from .region_map import decode_region_map, encode_region_map
 # PSNR in dB of the decoded render against the scene's own
 QUALITIES = (10.0, 90.0)  # least and largest
 DEFAULT_QUALITY = 46.0
-_MIN_DISTORTION = 1e-12  # squared error that a number adds
-# of a layer: its length and checksum take about 6 bytes, and a few hundred bytes arrive at once
-_MIN_SHARE = 1 / 16  # of the Gaussians of a file
+_MIN_DISTORTION = 1e-12  # least squared error that a number adds
+# least Gaussians of a layer: its length and checksum take about 6 bytes, and a few hundred bytes arrive at once
+_MIN_SHARE = 1 / 16  # as a share of the Gaussians of a file
 _MIN_GAUSSIANS = 100
-_FREE_GAUSSIANS = 64  # of a layer, whose other Gaussians take a bit each at least
+_FREE_GAUSSIANS = 64  # a layer has at least a bit for each Gaussian beyond these
 
 
 def encode(scene: Scene, *, quality: float | None = None, target_bytes: int | None = None) -> bytes:
     """Write a scene as a `.kcgs` file; the same scene gives the same bytes.
 
-    Convention: every parameter is rounded so that it adds the same squared error to the render; the fitted image plays
-    no part. Centres far outside the image are moved nearer. Gaussians whose colour rounds to black are left out. The
-    labels of the map are kept without loss, its softness is rounded to fortieths of a pixel.
-    :func:`kcgs.rate.compress` corrects most of the error where the image is at hand.
+    Convention: every parameter is rounded so that it adds the same squared error to the render; the fitted image is not
+    used. Centres far outside the image are moved nearer. Gaussians whose colour rounds to black are left out. The
+    labels of the map are lossless; its softness is rounded to fortieths of a pixel. If you have the image,
+    :func:`kcgs.rate.compress` corrects most of the error.
 
     Args:
-        scene: N Gaussians of one image; opacities are merged into the colours, metadata is not kept. A map of one
-            region is not kept, either.
-        quality: PSNR in dB of the decoded render against the scene's own, before clipping, 10 to 90; 46 by default.
-        target_bytes: writes the largest file of at most so many bytes, in place of `quality`.
+        scene: N Gaussians of one image. Opacities are merged into the colours; metadata and a map of one region are
+            not stored.
+        quality: PSNR in dB of the decoded render against the scene's own render, before clipping, 10 to 90; 46 by
+            default.
+        target_bytes: write the largest file of at most this size, in place of `quality`.
 
     Returns:
         The file.
@@ -73,7 +74,7 @@ def encode(scene: Scene, *, quality: float | None = None, target_bytes: int | No
 
 
 class SceneWriter:
-    """Writes files of a scene at any quantization parameter; its map is coded once."""
+    """Write files of a scene at any quantization parameter; its map is coded only once."""
 
     def __init__(self, scene: Scene) -> None:
         field, regions = check_scene(scene).field, scene.regions
@@ -84,7 +85,7 @@ class SceneWriter:
         tensors = field.means, field.cholesky, field.merged_colors()
         self.gaussians = Parameters(*(t.detach().cpu().double().numpy() for t in tensors))
         self.regions = None if regions is None or regions.num_regions == 1 else regions.to("cpu")
-        self.ids = np.zeros(field.num_gaussians, np.int64)  # as positions among the map's ids
+        self.ids = np.zeros(field.num_gaussians, np.int64)  # indices into the map's ids
         self.region_map = b""
         if self.regions is not None:
             assert field.region_ids is not None
@@ -95,7 +96,7 @@ class SceneWriter:
             self.region_map = encode_region_map(self.regions)
 
     def qp_for(self, quality: float | None, target_bytes: int | None = None) -> int:
-        """Return the quantization parameter at which rounding alone costs `quality`, PSNR in dB."""
+        """Return the quantization parameter at which rounding alone gives `quality`, a PSNR in dB."""
         if quality is not None and target_bytes is not None:
             raise InvalidArgument("quality", "None with target_bytes", quality)
         decibels = check_number("quality", DEFAULT_QUALITY if quality is None else quality, *QUALITIES, unit="dB")
@@ -121,9 +122,9 @@ class SceneWriter:
         return best
 
     def next_qp(self, qp: int, num_bytes: int, target_bytes: int) -> int:
-        """Return the quantization parameter for `target_bytes`, where the file of `qp` has `num_bytes`.
+        """Return the quantization parameter for `target_bytes`, if the file at `qp` has `num_bytes`.
 
-        An octave of the distortion is about a bit of each number.
+        An octave of the distortion is about one bit per number.
         """
         bits = (target_bytes - num_bytes) * 8
         return min(max(qp + math.floor(bits * QP_PER_OCTAVE / self._count_numbers()), QPS[0]), QPS[1])
@@ -138,7 +139,7 @@ class SceneWriter:
         return other
 
     def write_rounded(self, qp: int) -> bytes:
-        """Write the file of Gaussians that are rounded one by one."""
+        """Write the file with each Gaussian rounded on its own."""
         quantizer = Quantizer(qp, self.size)
         classes = quantizer.classify(self.gaussians)
         is_visible = quantizer.steps(classes).round_colors(self.gaussians.colors).any(1)
@@ -148,8 +149,8 @@ class SceneWriter:
         return self.write(quantizer, codes, self.ids[index])
 
     def write(self, quantizer: Quantizer, codes: Codes, ids: Integers) -> bytes:
-        """Write the file of Gaussians that are whole numbers already, with the positions of their regions' ids."""
-        # energies fall; within one energy sizes fall; within one size cells go row by row
+        """Write the file of quantized Gaussians; `ids` are indices into the map's ids."""
+        # order: falling energy, then falling size, then cells row by row
         order = np.lexsort((codes.cell[:, 0], codes.cell[:, 1], -codes.size, -codes.energy))
         codes, ids = codes.select(order), ids[order]
         coder, layers, entries = LayerCoder(quantizer, self.channels, self.regions), [], []
@@ -158,7 +159,7 @@ class SceneWriter:
         for layer in _join_groups(groups, len(ids)):
             writer, energy = Writer(), int(codes.energy[layer[0].start])
             coder.write(writer, [(codes.select(group), ids[group]) for group in layer])
-            # zeros at the end of a stream are left out, but a layer's length limits the number of its Gaussians
+            # a stream has no zeros at its end, but a layer's length limits the number of its Gaussians: pad it
             count = layer[-1].stop - layer[0].start
             layers.append(writer.finish().ljust(-(-(count - _FREE_GAUSSIANS) // 8), b"\0"))
             entries.append((energy, len(layers[-1])))
@@ -167,7 +168,7 @@ class SceneWriter:
 
 
 def _check_field(field: GaussianField) -> None:
-    """Validate the values again, which may have changed since the field was made, and the limits of a file."""
+    """Validate the values, which may have changed since the field was made, and the limits of a file."""
     check_floating("means", field.means.detach().float())
     check_cholesky("cholesky", field.cholesky.detach().float())
     check_floating("colors", field.merged_colors().detach().float())
@@ -186,7 +187,7 @@ def _black_field(field: GaussianField, regions: RegionMap | None) -> GaussianFie
 
 
 def _join_groups(groups: list[slice], count: int) -> list[list[slice]]:
-    """Join groups into layers of enough of the `count` Gaussians, since a layer has overhead."""
+    """Join groups into layers with enough of the `count` Gaussians: each layer has overhead."""
     layers: list[list[slice]] = []
     least = max(_MIN_GAUSSIANS, _MIN_SHARE * count)
     for group in groups:
@@ -211,12 +212,12 @@ def decode(data: bytes, *, max_bytes: int | None = None) -> Decoded:
     """Read a `.kcgs` file, or the coarser scene that its first bytes hold.
 
     Args:
-        data: the file, or its beginning, as long as the first layer is whole.
-        max_bytes: reads the first bytes only.
+        data: the file, or a beginning of it that has the whole first layer.
+        max_bytes: read at most this many bytes from the beginning.
 
     Returns:
-        The scene (float32, on the CPU, bit for bit the same on every machine; without a map where the file has none),
-        how many layers were read, and how many the file has.
+        The scene (float32, on the CPU, bit for bit the same on every machine; without a map if the file has none), how
+        many layers were read, and how many the file has.
 
     Raises:
         TypeError: an argument of the wrong type.

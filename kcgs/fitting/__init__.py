@@ -1,4 +1,4 @@
-"""An image in, a scene out."""
+"""Fit a scene of Gaussians to an image."""
 
 from .checks import check_image_and_regions, check_num_gaussians, default_num_gaussians
 from .config import FitConfig, available_recipes
@@ -14,7 +14,7 @@ from .result import FitResult, HistoryEntry
 from .state import FitState
 from .user_objects import Densifier
 
-# public; what else is imported here is for the other rooms of kcgs
+# the public names; other packages of kcgs use the other imports
 __all__ = [
     "Densifier", "FitConfig", "FitResult", "FitState", "HistoryEntry", "RegionReport", "available_recipes", "fit",
     "initial_field", "lowest_impact", "precompile", "propose_gaussians", "rank_gaussians",

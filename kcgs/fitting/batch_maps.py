@@ -8,12 +8,12 @@ from kcgs.functional import RegionMap
 
 
 def map_of_each(regions: RegionMap, count: int) -> list[RegionMap]:
-    """Return the map of each of so many images: of a batch its own, else the one that all have."""
+    """Return a map for each of `count` images: its own map from a batch, else the map that all images share."""
     return [map_of(regions, k) for k in range(count)]
 
 
 def map_of(regions: RegionMap, image: int) -> RegionMap:
-    """Return the map of an image: of a batch its own, else the one that all have."""
+    """Return the map of an image: its own map from a batch, else the map that all images share."""
     return regions if regions.num_maps is None else regions[image]
 
 
@@ -23,7 +23,7 @@ def regions_per_map(regions: RegionMap) -> list[int]:
 
 
 def join_maps(maps: Sequence[RegionMap | None]) -> RegionMap | None:
-    """Return the map of a batch from those of its images, each of one image or of the batch; None without maps."""
+    """Join a map for each image of a batch; a batch of maps counts as its map of that image. None without maps."""
     first = maps[0]
     if all(one is first for one in maps):
         return first

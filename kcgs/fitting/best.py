@@ -15,18 +15,18 @@ from .batch_maps import join_maps
 
 
 class Best(NamedTuple):
-    """A scene for each image that was measured, and how it ranks."""
+    """The best measured scene of each image, and the numbers that rank it."""
 
     field: GaussianField
     """A batch of copies; rows that a scene lacks have the colour 0."""
     maps: list[RegionMap | None]
-    """Of each image the map that it was rendered with, or the batch of maps that has it at the image's place."""
+    """For each image the map of its render, or a batch of maps that holds this map at the image's index."""
     is_draft: Tensor
-    """Rendered with the cutoff of a draft: any scene that is none beats it; bool, (B,)."""
+    """True for a scene rendered with the draft cutoff: all with the final cutoff rank higher. Bool, (B,)."""
     value: Tensor
-    """Squared error, or value of the objective, see `Objective.is_ranked_by_psnr`; (B,)."""
+    """Squared error, or value of the objective (see `Objective.is_ranked_by_psnr`), (B,)."""
     psnr: Tensor
-    """In dB, (B,)."""
+    """PSNR in dB, (B,)."""
 
     @property
     def scene(self) -> Scene:
@@ -34,7 +34,7 @@ class Best(NamedTuple):
         return Scene(self.field, join_maps(self.maps))
 
     def improved_by(self, other: Best) -> Best:
-        """Return for each image the better one: the other only where it has a lower value, or is the first final."""
+        """Return the better scene of each image: `other` where its value is lower, or where only `self` is a draft."""
         is_first_final = self.is_draft & ~other.is_draft
         is_lower = (other.value < self.value) & (self.is_draft == other.is_draft)
         wins = (is_first_final | is_lower) & ~other.value.isnan()

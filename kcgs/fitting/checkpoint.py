@@ -1,4 +1,4 @@
-"""A fit that was killed goes on where it stood."""
+"""Checkpoints: a fit that was killed continues from the last one."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from .result import HistoryEntry
 from .start import make_state
 from .state import FitState
 
-# a checkpoint is written when the fit has run this many times as long as the last one took to write
+# seconds between two checkpoints, per second that the first of them took to write
 _RUN_PER_WRITE = 100.0
 _VERSION = 11
 _DIGEST_SIZE = 32  # bytes of the SHA-256 of the content, which begins the file
 
 
 class Checkpoint:
-    """A file that holds a fit's state, written whole or not at all, and read for its own problem only."""
+    """A file with a fit's state: written atomically, and read only for the same problem."""
 
     def __init__(self, path: str | os.PathLike[str], problem: Problem) -> None:
         check_writable("checkpoint", path)
@@ -38,14 +38,11 @@ class Checkpoint:
         self._next_write = 0.0
 
     def is_due(self, state: FitState) -> bool:
-        """True at the last iteration, and where the file has not been written for a while.
-
-        So writing takes about a hundredth of the fit.
-        """
+        """True at the last iteration, and often enough before that writing takes about 1 % of the fit."""
         return time.perf_counter() >= self._next_write or state.iteration >= self.problem.config.iteration_limit
 
     def write(self, state: FitState, seconds: float) -> None:
-        """Put the state, and the seconds of the fit so far, in the file's place."""
+        """Replace the file by the state, and the seconds of the fit so far."""
         start = time.perf_counter()
         buffer = io.BytesIO()
         torch.save({"problem": _fingerprint(self.problem), "seconds": seconds, **_to_plain(state)}, buffer)
@@ -55,7 +52,7 @@ class Checkpoint:
         self._next_write = end + _RUN_PER_WRITE * (end - start)
 
     def read(self) -> tuple[FitState, float]:
-        """Return the state in the file, and the seconds of its fit; refuse what is damaged or another problem's."""
+        """Return the file's state and seconds; refuse a damaged file, or a file of another problem."""
         data = self.path.read_bytes()
         digest, content = data[:_DIGEST_SIZE], data[_DIGEST_SIZE:]
         if hashlib.sha256(content).digest() != digest:
@@ -70,7 +67,7 @@ class Checkpoint:
 
 
 def _fingerprint(problem: Problem) -> str:
-    # a fit that goes on may get more time
+    # a resumed fit may get more time
     settings = problem.config.model_dump_json(exclude={"max_seconds"})
     numbers = f"{_VERSION} {settings} {problem.num_gaussians} {problem.seed} {tuple(problem.canvas.shape)}"
     digest = hashlib.sha256(numbers.encode())
@@ -95,7 +92,7 @@ def _to_plain(state: FitState) -> dict[str, Any]:
 
 
 def _numbers(state: FitState) -> dict[str, float]:
-    """Return the fields of a state that are numbers, but its progress, which the clock may give anew."""
+    """Return the numeric fields of a state, without its progress: the clock computes that again."""
     values = {field.name: getattr(state, field.name) for field in fields(state) if field.name != "progress"}
     return {name: value for name, value in values.items() if isinstance(value, int | float)}
 

@@ -19,7 +19,7 @@ _LEAST_GAUSSIANS = 100
 
 
 def check_image_and_regions(image: Any, regions: object) -> tuple[Tensor, RegionMap | None]:
-    """Return a copy of the image, (C, H, W), that may take part in a graph, and its regions, on its device."""
+    """Return a copy of the image, (C, H, W), that autograd accepts, and its regions on the image's device."""
     image = as_image("image", image)
     regions = regions_of(image.shape[1:], regions)
     if regions is not None:
@@ -28,7 +28,7 @@ def check_image_and_regions(image: Any, regions: object) -> tuple[Tensor, Region
 
 
 def check_images_and_regions(images: Any, regions: object, keep_batch: bool = True) -> tuple[Tensor, RegionMap | None]:
-    """Do the same for one image, or a batch; the images are (B, C, H, W), and more than one have a map each."""
+    """Return copies of the images, (B, C, H, W), and their regions: several images have a map each."""
     if not (keep_batch and is_batch(images)):
         image, region_map = check_image_and_regions(images, regions)
         return image[None], region_map
@@ -45,13 +45,13 @@ def is_batch(images: object) -> bool:
 
 
 def _copy_of(image: Tensor) -> Tensor:
-    """Copy an image, as float32 or float64."""
+    """Copy an image as float64 if it is float64, else as float32."""
     dtype = torch.float64 if image.dtype == torch.float64 else torch.float32
     return image.detach().to(dtype, copy=True, memory_format=torch.contiguous_format)
 
 
 def regions_of(size: tuple[int, ...], regions: object, num_images: int | None = None) -> RegionMap | None:
-    """Return a label map as one map of a size; for a batch of images there may be one for each."""
+    """Return a label map as a RegionMap of this size; a batch of images may have a map for each image."""
     regions = as_region_map(regions)
     if regions is None:
         return None
@@ -65,13 +65,13 @@ def regions_of(size: tuple[int, ...], regions: object, num_images: int | None = 
 
 
 def default_num_gaussians(height: int, width: int) -> int:
-    """Return N for an image of a size: one Gaussian per 100 pixels, 100 at least, but no more than pixels."""
+    """Return the default N: one Gaussian per 100 pixels, at least 100, but at most the number of pixels."""
     pixels = height * width
     return min(pixels, max(_LEAST_GAUSSIANS, pixels // _PIXELS_PER_GAUSSIAN))
 
 
 def check_num_gaussians(value: object, image: Tensor) -> int:
-    """Return N if it is a number of Gaussians that an image (..., C, H, W) can use; for None the default."""
+    """Validate N, from 1 to the pixels of an image (..., C, H, W); None gives the default."""
     height, width = image.shape[-2:]
     if value is None:
         return default_num_gaussians(height, width)

@@ -4,7 +4,7 @@ import time
 
 
 class Clock:
-    """Wall time of a fit, in seconds; a fit that goes on after a break starts at what it has used."""
+    """Wall time of a fit, in seconds; a resumed fit starts at the seconds that it has already used."""
 
     def __init__(self, seconds: float = 0.0) -> None:
         self._started = time.perf_counter() - seconds

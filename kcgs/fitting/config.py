@@ -17,7 +17,7 @@ from kcgs.kernels import BACKENDS
 from kcgs.maps import MAX_SOFTNESS
 
 _USUAL_ITERATIONS = 700
-# settings of version 0.3, and what to write now
+# settings of version 0.3, and what replaces each
 _RENAMED = {
     "loss": "it is objective now, with the same values",
     "densify": "it is an argument of fit now, an event of your own; 'largest-error' is in benchmarks/core/image_gs.py",
@@ -29,9 +29,9 @@ _VALUES_OF_IMAGE_GS = ("image-gs", "gradient", "adam")
 class FitConfig(BaseModel):
     """Settings of a fit; the defaults are the recipe `best`.
 
-    Convention: all values are plain: numbers, strings and None. Functions of your own are arguments of
-    :func:`kcgs.fit`. Moments of a fit are fractions of its iterations, so that 500 and 50,000 both make sense. What an
-    event or an optimizer needs beyond these are fields of its class.
+    Convention: all values are numbers, bools, strings or None. Functions of your own are arguments of
+    :func:`kcgs.fit`. Points in time are fractions of the fit, so that they fit 500 iterations as well as 50,000. Other
+    parameters of an event or an optimizer are fields of its class.
 
     Raises:
         ValueError: an unknown setting, or a value of the wrong type or out of range.
@@ -128,7 +128,7 @@ class FitConfig(BaseModel):
         return check_objective(value)
 
     def model_post_init(self, context: Any) -> None:
-        """Check what types do not express."""
+        """Check the ranges that the types do not express."""
         if self.backend not in BACKENDS:
             raise InvalidArgument("backend", f"one of {', '.join(BACKENDS)}", repr(self.backend))
         if self.softness != "auto" and not 0.0 <= self.softness <= MAX_SOFTNESS:
@@ -140,12 +140,12 @@ class FitConfig(BaseModel):
 
     @property
     def planned_iterations(self) -> int:
-        """Iterations of a fit that no clock ends."""
+        """Iterations of a fit without a time limit."""
         return self.iterations or _USUAL_ITERATIONS
 
     @property
     def iteration_limit(self) -> float:
-        """Iterations of a fit; infinite where the clock alone ends it."""
+        """Largest number of iterations; infinite where only the clock ends the fit."""
         return math.inf if self.iterations is None and self.max_seconds is not None else self.planned_iterations
 
     def __repr__(self) -> str:
@@ -202,6 +202,6 @@ def _first(error: ValidationError) -> Exception:
 
 
 def _shown(value: object) -> str:
-    """Return a value as a message shows it, with where it went if it was one of Image-GS."""
+    """Return the text of a value for a message; a value of Image-GS is followed by its new place."""
     is_moved = isinstance(value, str) and value in _VALUES_OF_IMAGE_GS
     return repr(value) + (", which is now in benchmarks/core/image_gs.py" if is_moved else "")

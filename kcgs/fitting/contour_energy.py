@@ -26,19 +26,19 @@ Ints = NDArray[np.int64]
 Labels = NDArray[np.int32]
 Mask = NDArray[np.bool_]
 
-# sides of the boxes that are rendered, in pixels, are multiples of it
+# unit of the sides of rendered boxes, in pixels; larger units make fewer batches of larger boxes
 _BOX_UNIT = 16
-# pixels of boxes that are rendered at once
+# most pixels of a batch of boxes
 _BATCH_PIXELS = 1 << 20
 
 
 def index_map(regions: RegionMap, labels: Tensor) -> Labels:
-    """Return the position of each label among the ids of a map on the CPU, (H, W); -1 for a label that it lacks."""
+    """Return the index of each label, (H, W), among the ids of a map on the CPU; -1 for a label that the map lacks."""
     return np.asarray(regions.index_of(labels).numpy(), dtype=np.int32)
 
 
 def bounding_boxes(index: Labels, count: int, margin: int) -> Ints:
-    """Return (R, 4) top, bottom, left, right of each region's pixels, grown by the margin; empty where it has none."""
+    """Return (R, 4) top, bottom, left, right of each region, grown by the margin; zeros for a region without pixels."""
     from scipy.ndimage import find_objects
 
     boxes = np.zeros((count, 4), np.int64)
@@ -77,7 +77,7 @@ def region_costs(scene: Scene, image: Tensor, boxes: Ints, pad: int, sigma: floa
 
 
 def _pad_rows(gaussians: tuple[Tensor, ...], first: Tensor, end: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Make a batch of the rows from first to end, (B,), as long as the longest; what follows the end has no colour."""
+    """Make a batch of the rows from first to end, (B,), padded to the longest range with rows of the colour 0."""
     means, cholesky, colors = gaussians
     rows = first[:, None] + torch.arange(max(1, int((end - first).max())), device=first.device)
     is_member, rows = (rows < end[:, None])[:, :, None], rows.clamp_max(len(means) - 1)
@@ -87,7 +87,7 @@ def _pad_rows(gaussians: tuple[Tensor, ...], first: Tensor, end: Tensor) -> tupl
 def _region_errors(
     batch: tuple[Tensor, Tensor, Tensor], planes: Tensor, corners: Tensor, size: list[int], sigma: float, backend: str
 ) -> Tensor:
-    """Blurred squared error of each scene of a batch in boxes of one size, (B, h, w), at corners (B, 2), row first.
+    """Return the blurred squared error of each scene of a batch in its box, (B, h, w); corners, (B, 2), are (y, x).
 
     Planes, (C + 1, H, W), are the image and a mask of its pixels, with a margin.
     """
@@ -104,7 +104,7 @@ def _region_errors(
 
 
 class MovingLabels:
-    """A label map that changes, flat and with a rim of -1, so that the places of a pixel's neighbours are sums."""
+    """A label map that changes; it is flat with a rim of -1, so that a neighbour's index is a sum."""
 
     def __init__(self, index: Labels, costs: CostTable, length_weight: float, pad: int, smallest: int) -> None:
         padded = np.pad(index, pad, constant_values=-1)
@@ -112,21 +112,21 @@ class MovingLabels:
         self._labels, self._before = padded.reshape(-1), padded.flatten()
         self._smallest, self._pad, self._stride = smallest, pad, padded.shape[1]
         self._sides = disc(1, self._stride)[1:]
-        # two neighbours that differ count an eighth each
+        # a pair of neighbours that differ counts an eighth for each of its two pixels
         self._energy_of = self._labels, costs, length_weight / 4, disc(2, self._stride)
         self._areas = np.bincount(index.ravel())
         self._floor = np.minimum(self._areas, smallest)
         self._free = self._labels >= 0
-        self._specks = np.zeros(padded.size, np.bool_)  # pixels of pieces that were small before any move
+        self._specks = np.zeros(padded.size, np.bool_)  # True in pieces that were small before all moves
         self._specks[self._list_small_pieces()[0]] = True
-        self._limit = np.zeros(0, np.int32), np.zeros(0, np.int64)  # a pixel may take any label
+        self._limit = np.zeros(0, np.int32), np.zeros(0, np.int64)  # empty: a pixel may take any label
         counts = np.full(padded.size, NOT_COUNTED, np.int8)
         self._sweeps = SweepState(np.ones(padded.size, np.uint8), counts)
 
     def fix_cores(self, rim: Mask, distance: int) -> None:
-        """Pin the deepest pixels of the regions that moves of contours, up to a distance, could otherwise erase."""
+        """Pin the deepest pixels of regions that contours could erase by moving up to `distance` pixels."""
         depth, is_near = np.zeros(rim.shape, np.int16), rim
-        for _ in range(distance + 1):  # in squares around the rim: a distance transform takes ten times as long
+        for _ in range(distance + 1):  # chessboard distance: a distance transform takes ten times as long
             depth += ~is_near
             is_near = _grow(is_near)
         deep = self._areas - np.bincount(self.map[depth <= distance], minlength=len(self._areas))
@@ -139,19 +139,19 @@ class MovingLabels:
         self._free[(y[fixed] + self._pad) * self._stride + x[fixed] + self._pad] = False
 
     def limit_moves(self, anchor: Labels, distance: float) -> None:
-        """Allow a pixel only the labels that another map has within the distance."""
-        # repeated beyond the border: a label across it is nearer still
+        """Allow a pixel only the labels that the anchor has within the distance."""
+        # edge padding adds no label: the pixel that it repeats is nearer
         self._limit = np.pad(anchor, self._pad, mode="edge").reshape(-1), disc(distance, self._stride)
 
     def sweep(self, reach: int) -> bool:
-        """Give every free pixel near a contour its best label, before pieces are merged; True if one changed."""
+        """Give every free pixel near a contour its best label; True if a pixel changed."""
         neighborhood = disc(reach, self._stride)
         return bool(
             sweep_pixels(*self._energy_of, self._limit, self._free, self._list_edges(), neighborhood, self._sweeps)
         )
 
     def _list_edges(self) -> Ints:
-        """List the pixels that differ from the one right of them or below, in order."""
+        """List, in order, the pixels whose label differs from that of the pixel to the right or below."""
         here, stride = self._labels[: -self._stride], self._stride
         return np.flatnonzero((here != self._labels[1 : 1 - stride]) | (here != self._labels[stride:]))
 
@@ -160,9 +160,9 @@ class MovingLabels:
         return pixels, first
 
     def merge_pieces(self) -> bool:
-        """Merge small pieces that moves have made into their neighbours, the smallest first; True if one was merged.
+        """Merge small pieces that moves have made into their neighbours, the smallest first; True if any was merged.
 
-        Each call that returns True leaves fewer pieces, so that repetition ends.
+        Each call that returns True leaves fewer pieces, so repeated calls end.
         """
         pixels, pieces = self._list_small_pieces()
         order = np.lexsort((pixels, pieces))
@@ -170,7 +170,7 @@ class MovingLabels:
         areas = np.bincount(self.map.ravel(), minlength=len(self._floor))
         changed = np.zeros(len(self._labels), np.bool_)
         for piece in sorted(np.split(pixels, np.flatnonzero(np.diff(pieces)) + 1), key=len):
-            # beside one that was merged it may be larger now: the next call sees it
+            # a piece beside a merged piece may be larger now: the next call judges it
             if not len(piece) or changed[piece[:, None] + self._sides].any():
                 continue
             source, target = self._labels[piece[0]], self._best_label(piece, areas)
@@ -180,7 +180,7 @@ class MovingLabels:
         return bool(changed.any())
 
     def _best_label(self, piece: Ints, areas: Ints) -> int:
-        """Return the adjacent label under which a piece costs least; its present one where it must stay."""
+        """Return the adjacent label that costs a piece least; the present label where the piece must stay."""
         present = int(self._labels[piece[0]])
         was_small = bool((self._specks[piece] & (self._before[piece] == present)).any())
         if was_small or areas[present] - len(piece) < self._floor[present]:
@@ -191,12 +191,12 @@ class MovingLabels:
         return best if energies.get(best, math.inf) < math.inf else present
 
     def energy_change(self) -> float:
-        """Return the energy of the map, less that before all moves."""
+        """Return the energy of the map minus its energy before all moves."""
         return float(map_energy_change(self._before, *self._energy_of))
 
 
 def _grow(mask: Mask) -> Mask:
-    """Add the eight pixels around each one of a mask."""
+    """Add the eight neighbours of each pixel of a mask."""
     for axis in (0, 1):
         lines, grown = np.moveaxis(mask, axis, 0), np.moveaxis(mask.copy(), axis, 0)
         grown[1:] |= lines[:-1]

@@ -16,27 +16,27 @@ _UNKNOWN = 0
 _PENDING = 1
 _SMALL = 2
 _LARGE = 3
-# cost of a unit of curvature, in costs of two neighbours that differ
+# weight of curvature, in units of `pair_cost`, the cost of two neighbours with different labels
 _CURVATURE_COST = 1.2
-# in place of the excess of a pixel whose neighbours were not counted
+# marks a pixel whose excess is not known
 NOT_COUNTED = -128
 
 
 class SweepState(NamedTuple):
-    """What sweeps of one map leave to each other, for each pixel of the flat map."""
+    """The state that a sweep hands to the next sweep, for each pixel of the flat map."""
 
-    pending: Any  # uint8, in how many sweeps from the present one on it may change, unless pixels nearby do
-    excess: Any  # int8, how many more pixels around it differ from it than equal it, or NOT_COUNTED
+    pending: Any  # uint8, sweeps that still visit the pixel, with the present sweep; a change nearby sets it to 2
+    excess: Any  # int8, pixels around it with another label minus those with its own label, or NOT_COUNTED
 
 
 class CostTable(NamedTuple):
-    """Costs of pixels in regions, kept inside each region's box; positions are those of a map with a rim."""
+    """The cost of each pixel in each region, inside the region's box; coordinates include the map's rim."""
 
-    values: Any  # the boxes' pixels, one box after the other
-    starts: Any  # [R], of the boxes in values
+    values: Any  # costs of the boxes' pixels, one box after the other
+    starts: Any  # [R], index of each box's first value
     boxes: Any  # [R, 4], top, bottom, left, right
-    widths: Any  # [R], values of a row of the box
-    stride: int  # pixels of a row of the map
+    widths: Any  # [R], values per row of the box
+    stride: int  # pixels per row of the map
 
 
 @inner
@@ -58,21 +58,22 @@ def _has(labels, pixel, offsets, label):
 
 @inner
 def _allows(limit, pixel, label):
-    """True where a pixel may have a label: `limit` is a map, and offsets of a disc that holds it there, or none."""
+    """True if the map of `limit` has the label in the disc around the pixel; an empty disc allows every label."""
     anchor, disc = limit
     return len(disc) == 0 or _has(anchor, pixel, disc, label)
 
 
 @program.entry
 def sweep_pixels(labels, costs, pair_cost, disc, limit, free, edges, neighborhood, state):
-    """Give every free pixel the best label of its neighborhood; True if one changed.
+    """Give every free pixel the best label of its neighborhood; True if a pixel changed.
 
-    The map is flat and has a rim of -1; `edges` are the pixels that differ from the one right of them or below.
-    Neighborhoods are those before the sweep. A pixel near which none has changed since its last visit would stay.
+    The map is flat and has a rim of -1. `edges` are the pixels whose label differs from that of the pixel to the right
+    or below. Candidate labels are those before the sweep. Pixels without a change nearby since their last visit are
+    skipped: they would keep their labels.
     """
     before, changed = labels.copy(), False
     pixels, parities = _list_near_contours(labels, free, edges, costs.stride, neighborhood)
-    for parity in range(4):  # neighbours differ in parity: pixels of one parity change at the same time
+    for parity in range(4):  # neighbours differ in parity
         for k in range(len(pixels)):
             pixel = pixels[k]
             if parities[k] != parity or state.pending[pixel] == 0:
@@ -96,7 +97,7 @@ def sweep_pixels(labels, costs, pair_cost, disc, limit, free, edges, neighborhoo
 
 @inner
 def _list_near_contours(labels, free, edges, stride, neighborhood):
-    """List the free pixels whose neighborhood holds the two sides of a contour, and a few more; with their parities."""
+    """List the free pixels near both sides of a contour, and a few more, with their parities."""
     pixels, parities = np.empty(len(labels), np.int64), np.empty(len(labels), np.uint8)
     is_listed, count = np.zeros(len(labels), np.bool_), 0
     for pixel in edges:
@@ -115,7 +116,7 @@ def _list_near_contours(labels, free, edges, stride, neighborhood):
 
 @inner
 def _change(labels, state, disc, neighborhood, pixel, label):
-    """Give a pixel a label, and keep the state of the sweeps."""
+    """Give a pixel a label, and update the state of the sweeps."""
     present, labels[pixel], state.excess[pixel] = labels[pixel], label, NOT_COUNTED
     for offset in neighborhood:
         state.pending[pixel + offset] = 2
@@ -158,13 +159,13 @@ def _curved_energy(labels, state, costs, pair_cost, disc, pixel, label):
 
 @inner
 def _curvature(labels, disc, pixel):
-    """Return the square of how many more pixels around one differ from it than equal it; 0 if no more do."""
+    """Return the square of a pixel's excess; 0 for a negative excess."""
     return 0 if labels[pixel] == -1 else max(_count_excess(labels, disc, pixel), 0) ** 2
 
 
 @inner
 def _count_excess(labels, disc, pixel):
-    """Return how many more pixels around one differ from it than equal it."""
+    """Return the excess of a pixel: the pixels around it with another label minus those with its own label."""
     excess, center = 0, labels[pixel]
     for offset in disc[1:]:
         label = labels[pixel + offset]
@@ -174,7 +175,7 @@ def _count_excess(labels, disc, pixel):
 
 @program.entry
 def piece_energy(labels, costs, pair_cost, disc, limit, piece, label):
-    """Return the energy of a piece under a label, up to a constant, without curvature; infinite where not allowed."""
+    """Return the energy of a piece with a label, up to a constant, without curvature; inf if it may not have it."""
     total = 0.0
     for pixel in piece:
         total += _energy(labels, costs, pair_cost, disc, pixel, label) if _allows(limit, pixel, label) else math.inf
@@ -183,7 +184,7 @@ def piece_energy(labels, costs, pair_cost, disc, limit, piece, label):
 
 @program.entry
 def map_energy_change(before, after, costs, pair_cost, disc):
-    """Return the energy of a flat map with a rim of -1, less that of another."""
+    """Return the energy of `after` minus that of `before`; both are flat maps with a rim of -1."""
     change, is_counted = 0.0, np.zeros(len(after), np.bool_)
     for pixel in range(len(after)):
         if after[pixel] == before[pixel]:
@@ -198,17 +199,17 @@ def map_energy_change(before, after, costs, pair_cost, disc):
         for offset in disc[1:9]:
             old, new = before[pixel + offset], after[pixel + offset]
             pairs = int(-1 != new != after[pixel]) - int(-1 != old != before[pixel])
-            # pairs of two pixels that changed come twice
+            # a pair of two changed pixels is counted twice
             change += pair_cost * pairs * (1.0 if new == old else 0.5)
     return change
 
 
 @program.entry
 def find_small_pieces(labels, edges, stride, smallest):
-    """Return the pixels of 4-connected pieces under `smallest` pixels, and the first pixel of each one's piece.
+    """Return the pixels of 4-connected pieces under `smallest` pixels, and for each the first pixel of its piece.
 
     The map is flat and has a rim of -1; `edges` are as for `sweep_pixels`. Every piece has a pixel beside another
-    label: from there it is filled, until it is too large.
+    label. A flood fill starts at this pixel and stops when the piece is too large.
     """
     state, queue = np.zeros(len(labels), np.uint8), np.empty(smallest, np.int64)
     pixels, first, end = np.empty(64, np.int64), np.empty(64, np.int64), 0
@@ -224,7 +225,7 @@ def find_small_pieces(labels, edges, stride, smallest):
                     more = np.empty(len(pixels) + count, np.int64)
                     pixels, first = np.append(pixels, more), np.append(first, more)
                 least = seed
-                for k in range(count):  # a copy of a slice, or its least element, would take seconds more to compile
+                for k in range(count):  # slices and `min` would take seconds more to compile
                     pixels[end + k], least = queue[k], min(least, queue[k])
                 for k in range(end, end + count):
                     first[k] = least
@@ -234,7 +235,7 @@ def find_small_pieces(labels, edges, stride, smallest):
 
 @inner
 def _fill(labels, stride, seed, state, queue):
-    """Fill the queue with the piece around a pixel; return how many pixels it has, 0 if it has more than fit."""
+    """Fill the queue with the piece of a pixel; return the number of its pixels, 0 if the piece is too large."""
     queue[0], state[seed], count, k, is_large = seed, _PENDING, 1, 0, len(queue) == 1
     while k < count and not is_large:
         for step in (-stride, -1, 1, stride):

@@ -29,11 +29,11 @@ def refine_contours(
     smallest: int = 12,
     backend: str = "auto",
 ) -> RegionMap:
-    """Move contours to where the image is explained better, at most `max_distance` from the map `anchor`.
+    """Move contours where this lowers their energy, at most `max_distance` pixels from the map `anchor`.
 
-    Exact coordinate descent on the energy in docs/method.md; no region is lost. Pieces under `smallest` pixels that
-    moves have made are merged into the adjacent label that costs least. The map is on the CPU. Where no move lowers the
-    energy, the result is the scene's map itself.
+    The method is exact coordinate descent on the energy in docs/method.md; no region is lost. Pieces under `smallest`
+    pixels that moves have made are merged into the adjacent label that costs least. The result is on the CPU. If no
+    move lowers the energy, it is the scene's own map.
 
     Source: Mumford and Shah's functional of 1989; Besag's iterated conditional modes of 1986.
     """
@@ -66,14 +66,14 @@ def refine_contours(
 def move_contours(
     gaussians: Gaussians, renderer: Renderer, image: Tensor, anchor: Tensor, config: FitConfig, max_rise: float
 ) -> RegionMap:
-    """Refine the contours of a map, and accept the moves that do not raise the squared error about them too much.
+    """Refine the contours of a map, and accept the moves that raise the squared error around them little enough.
 
     Args:
         gaussians: of one image.
         renderer: with the map.
         image: (C, H, W).
         anchor: labels (H, W) that contours may not move far from.
-        config: how far, and what a pixel of contour costs.
+        config: has the largest move and the cost of a pixel of contour.
         max_rise: factor by which a move may raise the squared error.
     """
     regions = renderer.regions
@@ -98,10 +98,11 @@ def move_contours(
 
 
 def accept_moves(before: RegionMap, after: RegionMap, gain: Tensor) -> RegionMap:
-    """Accept, of the moves between two maps on the CPU, those whose surroundings are rendered better; lose no region.
+    """Accept the moves between two maps on the CPU around which the render improves; lose no region.
 
-    Moves are judged by the region's Gaussians alone; the render blends them over soft contours. Pixels that changed are
-    grouped with all within two pixels, and a group stays changed where its gain, (H, W), is positive in its sum.
+    The moves were proposed by each region's Gaussians alone, but the render blends regions over soft contours. Changed
+    pixels form groups with all pixels within two pixels. A group stays changed if the sum of its gain, (H, W), is
+    positive.
     """
     from scipy import ndimage
 

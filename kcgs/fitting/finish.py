@@ -21,7 +21,7 @@ from .state import FitState, Measurement, record
 
 
 def finish(state: FitState, reason: str, clock: Clock) -> FitResult:
-    """Measure the last scene, take the best, and prune it; return a fit that ended for a reason."""
+    """Measure the last scene, prune the best scene, and return it with the reason why the fit ended."""
     _measure_last(state, clock.seconds())
     assert state.best is not None
     problem, config = state.problem, state.problem.config
@@ -39,7 +39,7 @@ def finish(state: FitState, reason: str, clock: Clock) -> FitResult:
 
 
 def _report_regions(problem: Problem, scene: Scene) -> RegionReport | list[RegionReport] | None:
-    """Say what became of the map, or of the map of each image of a batch."""
+    """Report what became of the map, or of the map of each image of a batch."""
     dropped: Literal["recipe"] | None = None if problem.config.guidance else "recipe"
     if problem.regions is None:
         return None
@@ -51,7 +51,7 @@ def _report_regions(problem: Problem, scene: Scene) -> RegionReport | list[Regio
 
 @torch.no_grad()
 def _measure_last(state: FitState, seconds: float) -> None:
-    """Measure the best with the cutoff of the result, and the last scene of images that did not diverge."""
+    """Measure the best scenes with the final cutoff, and the last scene of images that did not diverge."""
     problem = state.problem
     state.end_drafts()
     if state.best is not None and bool(state.best.is_draft.any()):

@@ -16,28 +16,28 @@ from kcgs.nn import GaussianField
 from .batch_maps import map_of_each
 from .checks import check_images_and_regions, check_num_gaussians, is_batch
 
-# sum of the weights of Gaussians of half the spacing at a pixel
+# sum of all weights at a pixel, for Gaussians with a sigma of half their spacing
 _OVERLAP = math.pi / 2
 
 
 def initial_field(
     image: Any, num_gaussians: int, regions: RegionMap | Tensor | None = None, seed: int = 0
 ) -> GaussianField:
-    r"""Scatter round Gaussians uniformly over an image, in its colours: the start of a fit, and of a loop of your own.
+    r"""Scatter round Gaussians uniformly over an image, in its colours, as the start of a fit or of your own loop.
 
     Convention: standard deviations are half the spacing of the Gaussians, so that together they show a blurred image.
-    No region starts without a Gaussian while another has two. The same seed gives the same field. Of a batch of images
-    each gets the field that it gets alone.
+    No region starts without a Gaussian while another region has two. The same seed gives the same field. An image of a
+    batch gets the same field as it gets alone.
 
     Args:
         image: as :func:`kcgs.fit` takes it, or a batch, :math:`(B, C, H, W)`.
         num_gaussians: N, from 1 to the number of pixels.
-        regions: label map or RegionMap of the image's size, for a batch one for all or one for each image; each
+        regions: label map or RegionMap of the image's size; a batch has one for all images or one for each. Each
             Gaussian gets the region under its centre.
         seed: of the random centres.
 
     Returns:
-        A field of N Gaussians, on the device of the image; a batch of B of them for :math:`(B, C, H, W)`.
+        A field of N Gaussians, on the device of the image; a batch of B such fields for :math:`(B, C, H, W)`.
 
     Raises:
         TypeError, ValueError: as :func:`kcgs.fit`.
@@ -67,7 +67,7 @@ def uniform_field(images: Tensor, num_gaussians: int, regions: RegionMap | None,
 
 
 def initial_sigma(size: tuple[int, int], num_gaussians: int) -> float:
-    """Return half the spacing of so many Gaussians on an image of this size, in pixels."""
+    """Return half the spacing of the Gaussians on an image of this size, in pixels, at least 1."""
     return max(1.0, 0.5 * math.sqrt(size[0] * size[1] / num_gaussians))
 
 
@@ -81,21 +81,21 @@ def random_field(images: Tensor, num_gaussians: int, regions: RegionMap | None, 
     if regions is None:
         tables = (table.detach().expand(batch, -1, -1) for table in (field.means, field.cholesky, field.colors))
         return GaussianField(*tables, size=field.size).to(images.device)
-    maps = map_of_each(regions.to("cpu"), batch)  # a device would be waited for in each empty region
+    maps = map_of_each(regions.to("cpu"), batch)  # on a GPU each empty region would cost a host sync
     fields = [_assign_regions(copy.deepcopy(field), one, seed) for one in maps]
     return GaussianField.stack(fields).to(images.device)
 
 
 @torch.no_grad()
 def _assign_regions(field: GaussianField, regions: RegionMap, seed: int) -> GaussianField:
-    """Give Gaussians the regions under their centres, and move some into regions that would have none."""
+    """Give Gaussians the regions under their centres, and move some Gaussians into empty regions."""
     field.assign_regions(regions)
     _fill_empty_regions(field, regions, seed)
     return field.assign_regions(regions)
 
 
 def _fill_empty_regions(field: GaussianField, regions: RegionMap, seed: int) -> None:
-    """Move Gaussians from the regions with most into those with none, the largest first, to a random pixel there."""
+    """Move a Gaussian from the fullest region to a random pixel of each empty region, the largest region first."""
     assert field.region_ids is not None
     generator = torch.Generator().manual_seed(seed)
     labels, index = regions.labels, regions.index_of(field.region_ids)

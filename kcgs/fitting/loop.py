@@ -58,19 +58,22 @@ def fit(
     r"""Fit Gaussians to an image, or to all images of a batch at once.
 
     Convention: on one device, the same arguments and number of threads give the same scene, bit for bit (unless the
-    clock stops it). On a GPU the history comes up to 20 iterations late. The best state that was logged is returned,
-    not the last. The first 85 % of a fit render drafts with a larger cutoff, and are not compared with the rest. The
-    scene holds fewer than N Gaussians where the recipe prunes, or its target takes fewer. With `target_psnr` several
-    fits search for about the fewest Gaussians that reach it; `on_step` counts the iterations of each.
+    clock stops the fit). On a GPU history entries arrive up to 20 iterations late. The result is the best measured
+    scene, not the last. In the first 85 % of a fit, scenes are drafts with a larger cutoff; later scenes rank
+    above all drafts. With `target_psnr`, several fits search for about the fewest Gaussians that reach it, and
+    `on_step` counts the iterations of each fit. The scene may have fewer than N Gaussians: pruning removes some, and a
+    search ends with fewer.
 
-    All images of a batch have the same number of rows; one that an image has no use for has the colour 0. On a CPU an
-    image gets the scene that it gets alone with the same seed, bit for bit, unless the clock stops the fit, there are
-    hardly more Gaussians than regions, or it has no use for all of them. An image whose numbers overflow keeps its best
-    scene, with a UserWarning, and the others go on. The history has means over the images.
+    All images of a batch have the same number of rows; rows that an image does not need have the colour 0. On a CPU
+    each image gets, bit for bit, the scene that it gets alone with the same seed. The exceptions: the clock stops the
+    fit, there are hardly more Gaussians than regions, or the image does not need all its Gaussians. An image whose
+    numbers overflow keeps its best scene, with a UserWarning; the other images go on. The history has means over the
+    images.
 
-    The history's `loss` is the value of the objective. With a loss of your own, such as one of Kornia's, the scene of
-    the lowest is returned. Gaussians are added where the render differs from the image, and contours move to it;
-    without an image they are added where the loss has its slope, contours stay, and PSNR is NaN.
+    The history's `loss` is the value of the objective. With a loss of your own, such as a loss of Kornia, the result is
+    the scene with the lowest loss. Gaussians are added where the render differs from the image, and contours move to
+    the image's edges. Without an image, Gaussians are added where the gradient of the loss is large, contours stay, and
+    PSNR is NaN.
 
     Args:
         image: Tensor :math:`(C, H, W)`, or a batch :math:`(B, C, H, W)`, floating, values in [0, 1]; a numpy array
@@ -78,45 +81,45 @@ def fit(
             None with a loss of your own that does not need it.
         regions: label map of the image's size: a Tensor or a numpy array, integer or bool, a PIL image, or a path, as
             :func:`kcgs.data.load_labels` reads it; or a RegionMap. EF-PSNR is measured along its contours. None: one
-            region. For a batch one for all images, or one for each.
-        num_gaussians: N, the most there may be for each image, from 1 to the number of pixels; None: one per 100
-            pixels, at least 100. Where it is below the number of regions, those most alike are merged until each has a
-            Gaussian, or with ``merge_regions=False`` the smaller ones stay empty and black; a UserWarning gives their
-            number.
+            region. A batch has one map for all images, or one for each.
+        num_gaussians: N, the most Gaussians of each image, from 1 to the number of pixels; None: one per 100 pixels,
+            at least 100. If N is below the number of regions, similar regions are merged until there are N; with
+            ``merge_regions=False`` the smaller regions stay empty and black. A UserWarning gives their number.
         recipe: a name from :func:`available_recipes`, or settings.
-        objective: what is lowered, by a name of :class:`FitConfig`; or a loss of your own, a function from a render,
-            :math:`(1, C, H, W)`, not clipped, to a scalar, through which autograd goes. None: the recipe's, else l2.
-        initializer: the first Gaussians, by a name of :class:`FitConfig`; or a function with the arguments of
-            :func:`kcgs.fitting.initial_field`: the images, :math:`(B, C, H, W)`, or grey ones without an image; how
-            many Gaussians to begin with; a RegionMap or None; and the seed. It returns a GaussianField with this batch
-            size, and with region ids where there is a map. None: the recipe's.
+        objective: the loss to minimize, by its name in :class:`FitConfig`; or a function of your own from a render,
+            :math:`(1, C, H, W)`, not clipped, to a differentiable scalar. None: the recipe's objective, else l2.
+        initializer: the first Gaussians, by a name of :class:`FitConfig`; or a function of the images,
+            :math:`(B, C, H, W)` (grey images where `image` is None), the number of Gaussians to begin with, a RegionMap
+            or None, and the seed, as :func:`kcgs.fitting.initial_field` takes them. It returns a GaussianField with
+            this batch size, and with region ids if there is a map. None: the recipe's initializer.
         densify: an event of your own that adds Gaussians: an object with ``act(state)``, called before every step, and
             ``end``, the share of the fit at its last addition. None: matching pursuit.
         optimizer: a name of :class:`FitConfig`, or a function from a field to an optimizer with the methods of
             :class:`kcgs.optim.GaussianAdam`, and its members ``rate``, ``has_drafts`` and ``keeps_averages``, such as a
-            :class:`kcgs.optim.ReparametrizedOptimizer`. None: the recipe's.
+            :class:`kcgs.optim.ReparametrizedOptimizer`. None: the recipe's optimizer.
         seed: of the random start.
         on_step: called after every iteration with its number (from 1) and the last history entry; returning True
             stops the fit.
         progress: show a bar, on a terminal or in a notebook.
-        checkpoint: a file to write the state to from time to time, whole or not at all.
+        checkpoint: a file for the state, replaced atomically from time to time.
         resume: go on from `checkpoint` where it exists; the result is that of an uninterrupted fit.
         size: (height, width) of the render, without an image.
         channels: C, without an image.
         settings: other fields of :class:`FitConfig`, in place of the recipe's.
 
     Returns:
-        The scene (its contours moved, its regions merged, where the recipe does so), history, why it stopped, settings,
-        how many Gaussians were pruned, and what became of the regions. For :math:`(B, C, H, W)` the scene is a batch,
-        also of one image, and PSNR and number of pruned Gaussians are :math:`(B)`.
+        The scene (with moved contours and merged regions, if the recipe does so), the history, why the fit stopped, the
+        settings, the number of pruned Gaussians, and what became of the regions. For :math:`(B, C, H, W)`, also with
+        B = 1, the scene is a batch, and PSNR and the number of pruned Gaussians are :math:`(B)`.
 
     Raises:
         TypeError: wrong types.
         ValueError: an image that is not finite or not in [0, 1], regions of another size, N below 1 or
-            above the number of pixels, unknown recipe or setting, a checkpoint that is damaged or of another fit, or
-            one of a fit with functions of your own, which no file keeps; no image and no size; a loss that is no scalar
-            or does not depend on the render; first Gaussians of another number or size; an optimizer that lacks a
-            member; several images with `target_psnr`, a checkpoint or a loss of your own, or more than fit into memory.
+            above the number of pixels, unknown recipe or setting, a checkpoint that is damaged or of another fit, a
+            checkpoint together with functions of your own, which no file can hold; no image and no size; a loss that is
+            no scalar or does not depend on the render; first Gaussians of another number or size; an optimizer that
+            lacks a member; several images with `target_psnr`, a checkpoint or a loss of your own; more images than fit
+            into memory.
         OSError: a checkpoint that cannot be written; raised before the fit.
 
     Example:
@@ -148,7 +151,7 @@ def fit(
 
 @lru_cache(maxsize=64)
 def precompile(config: FitConfig, device: torch.device | str = "cpu") -> None:
-    """Compile and load what fits of these settings need, so that no clock counts it; with `max_seconds`, `fit` does."""
+    """Compile and load all that a fit with these settings needs; with `max_seconds`, `fit` does so before its clock."""
     ramp = torch.linspace(0.0, 1.0, 96, device=device)
     image = torch.stack([ramp.expand(64, 96), 1 - ramp.expand(64, 96), (8 * ramp).sin().square().expand(64, 96)])
     labels = (ramp > 0.6).long().expand(64, 96).contiguous()
@@ -166,7 +169,7 @@ def fit_problem(
     until: float = 1.0,
     stepper_of: Callable[[FitState], Stepper] = make_stepper,
 ) -> FitResult:
-    """Solve a problem whose arguments are checked, up to a share of its schedule: see `fit`."""
+    """Fit a checked problem, up to the share `until` of its schedule: see `fit`."""
     canvas = problem.canvas
     if problem.config.max_seconds is not None:
         precompile(problem.config, canvas.device)
@@ -195,7 +198,7 @@ def _run(
     store: Checkpoint | None = None,
     until: float = 1.0,
 ) -> FitResult:
-    """Take a fit from its state to its end: events act, the stepper steps."""
+    """Run a fit from its state to its end: before each step the events act."""
     config, stepper = state.problem.config, stepper_of(state)
     limit, max_seconds = config.iteration_limit, config.max_seconds or math.inf
 

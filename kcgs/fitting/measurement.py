@@ -14,7 +14,7 @@ from .state import Errors, FitState, Measurement
 
 
 def snapshot(state: FitState, seconds: float) -> Measurement:
-    """Copy the scene of a state, so many seconds after the start of the fit."""
+    """Copy the scene of a state, `seconds` after the start of the fit."""
     scene = Scene(copy.deepcopy(state.field), state.regions)
     return Measurement(state.iteration, seconds, scene, state.is_draft, [*state.diverged])
 

@@ -12,16 +12,18 @@ from kcgs.compiled.tasks import first_task, next_task, ranges, run_tasks
 
 program = Program("measurement of a fit")
 
-# columns that one task sums up, at least, and pixels for which another thread is woken
+# least columns per task
 _COLUMNS = 64
+# pixels per thread
 _THREAD_PIXELS = 1 << 16
 
 
 def mean_errors(rendered: Any, image: Any, band: Any, *, is_squared: bool) -> Any:
-    """Return for each image of renders (B, C, H, W) three means, (B, 3).
+    """Return three means, (B, 3), for each image of renders (B, C, H, W).
 
-    They are the mean error, absolute or squared; the mean squared error once the render is clipped; and the latter of
-    the pixels whose image, row and column `band` lists, (M, 3), in the order of images, or NaN.
+    They are the mean error, absolute or squared; the mean squared error of the clipped render; and the same over the
+    pixels of `band`, NaN without such pixels. Rows of `band`, (M, 3), are image, row and column, in the order of
+    images.
     """
     batch, _, height, width = rendered.shape
     loss, squares = np.zeros((batch, width)), np.zeros((batch, width))
@@ -37,7 +39,7 @@ def _clipped_error(value, target):
 
 @program.entry
 def _sum_columns(rendered, image, is_squared, loss, squares, tasks, counters):
-    """Add up the errors of each column; tasks are ranges of columns, which are numbered through all images."""
+    """Add up the errors of each column; tasks are ranges of columns, numbered across all images."""
     _, channels, height, width = rendered.shape
     k = first_task(tasks, counters)
     while k >= 0:
@@ -55,7 +57,7 @@ def _sum_columns(rendered, image, is_squared, loss, squares, tasks, counters):
 
 @program.entry
 def _mean(rendered, image, band, loss, squares):
-    """Return the means of columns, and those of the band."""
+    """Return the means over all columns, and over the band."""
     batch, channels, height, width = rendered.shape
     means = np.empty((batch, 3))
     first = 0

@@ -1,4 +1,4 @@
-"""The optimizers of a fit by their names, or a user's own."""
+"""The optimizer of a fit, by its name or from a user's function."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .user_objects import check_optimizer
 
 
 def make_optimizer(problem: Problem, field: GaussianField, sigma: float) -> Any:
-    """Return the optimizer of a field whose Gaussians begin so many pixels wide."""
+    """Return the optimizer of a field whose Gaussians begin with `sigma`, in pixels."""
     if problem.objects.optimizer is not None:
         return check_optimizer(problem.objects.optimizer(field))
     return _OPTIMIZERS[problem.config.optimizer](problem.config, field, sigma)

@@ -21,45 +21,45 @@ from .checks import check_images_and_regions, check_num_gaussians, is_batch, reg
 from .config import FitConfig
 from .user_objects import NO_OBJECTS, UserObjects
 
-# of every value, where there is no image
+# value of the canvas where there is no image
 _GREY = 0.5
-# peak memory of a fit: bytes per pixel, per value of an image, and per Gaussian, measured
+# measured peak memory of a fit: bytes per pixel, per value of an image, and per Gaussian
 _PIXEL_BYTES = 50
 _CHANNEL_BYTES = 50
 _GAUSSIAN_BYTES = 1000
-# share of an image's values that are 0 or 1 from which on `clamp="auto"` lets Gaussians overshoot them
+# `clamp="auto"` clips the render where an image is 0 or 1, if at least this share of its values are
 _SATURATED_SHARE = 0.25
 
 
 @dataclass(frozen=True)
 class Problem:
-    """What is to be fitted; nothing here changes during a fit."""
+    """The checked arguments of a fit; nothing here changes during a fit."""
 
     canvas: Tensor
-    """(B, C, H, W), in [0, 1]: the images, or grey of the size of the render, which the first Gaussians show."""
+    """The images, (B, C, H, W), in [0, 1]; without images, grey of the size of the render."""
     regions: RegionMap | None
-    """The map as the user gave it, of one image; of more images one for each."""
+    """The user's map; several images have a map each."""
     num_gaussians: int
-    """N, the most that the result may have for each image."""
+    """N, the most Gaussians of each image in the result."""
     config: FitConfig
-    """Its objective is a name, unless `objects` has one."""
+    """Its objective is a name, unless `objects` has an objective."""
     seed: int
     objects: UserObjects = NO_OBJECTS
     has_image: bool = True
-    """False: only the objective says what is wanted."""
+    """False: there is only the objective, and no image to compare with."""
     is_batch: bool = False
-    """The user gave a batch, perhaps of one image, and gets one."""
+    """True if the user passed a batch, also of one image: the result is then a batch."""
     reduction: int = 1
     """Factor by which the sides of a photo were reduced to those of the image."""
 
     @property
     def image(self) -> Tensor | None:
-        """The images, (B, C, H, W), if there are any."""
+        """The images, (B, C, H, W); None if there are none."""
         return self.canvas if self.has_image else None
 
     @property
     def num_images(self) -> int:
-        """B."""
+        """The number of images, B."""
         return len(self.canvas)
 
     @property
@@ -69,12 +69,12 @@ class Problem:
 
     @property
     def device(self) -> torch.device:
-        """Where the fit is computed."""
+        """The device of the fit."""
         return self.canvas.device
 
     @cached_property
     def bounds(self) -> tuple[Tensor, Tensor] | None:
-        """The values to which the render is clipped in training, if it is: two tensors (B, C, H, W), or scalars.
+        """Lower and upper bounds of the render in training, two tensors (B, C, H, W) or scalars; None: no clipping.
 
         A clipped value has no gradient, even where it is wrong. So `clamp="auto"` clips at 0 only where an image is 0,
         and at 1 only where it is 1.
@@ -90,7 +90,7 @@ class Problem:
 
     @cached_property
     def band(self) -> Tensor:
-        """Image, row and column (M, 3) of the pixels near a contour of the user's map, for EF-PSNR."""
+        """Image, row and column, (M, 3), of the pixels near a contour of the user's map, for EF-PSNR."""
         mask = self.band_mask
         if mask is None:
             return torch.empty(0, 3, dtype=torch.int64, device=self.device)
@@ -98,24 +98,24 @@ class Problem:
 
     @cached_property
     def band_mask(self) -> Tensor | None:
-        """The same pixels as a mask, (..., 1, H, W); None without a map."""
+        """The pixels of `band` as a mask, (..., 1, H, W); None without a map."""
         return None if self.regions is None else edge_band(self.regions.labels).unsqueeze(-3)
 
     @cached_property
     def num_excess_regions(self) -> int:
-        """Regions of all images beyond the number of Gaussians, which are merged or stay black; 0 without guidance."""
+        """Number of regions, in all images, that are merged or stay black as N is too small; 0 without guidance."""
         if self.regions is None or not self.config.guidance:
             return 0
         return sum(max(0, count - self.num_gaussians) for count in regions_per_map(self.regions))
 
     def chooses_softness(self, image: int) -> bool:
-        """Whether the softness of the contours of an image is to be chosen, since its map came without."""
+        """Whether the fit chooses the softness of an image's contours: the setting is auto, and the map has none."""
         softness = None if self.regions is None else self.regions.softness
         return self.config.softness == "auto" and (softness[image] if isinstance(softness, tuple) else softness) == 0.0
 
     @cached_property
     def objective(self) -> Objective:
-        """What the descent lowers."""
+        """The objective that the descent lowers."""
         if self.objects.objective is not None:
             return LossObjective(self.objects.objective, self.image)
         return self.make_objective(self.canvas)
@@ -150,7 +150,7 @@ def make_problem(
             raise InvalidArgument("size", "(height, width) without an image", None)
         if config.target_psnr is not None:
             raise InvalidArgument("target_psnr", "None without an image", config.target_psnr)
-        # what needs an image: contours stay as they are
+        # moving contours, merging regions and choosing softness need an image
         update = {"move_contours": False, "merge_regions": False}
         config = config.model_copy(update=update | ({"softness": 0.0} if config.softness == "auto" else {}))
         canvas = torch.full((1, check_count("channels", channels), *check_size("size", size)), _GREY)
@@ -170,7 +170,7 @@ def make_problem(
 
 
 def _check_batch(problem: Problem) -> None:
-    """Refuse what takes one image at a time, and more images than there is memory for."""
+    """Refuse settings that take one image at a time, and batches that do not fit into memory."""
     count, channels, height, width = problem.canvas.shape
     for name, expected, value in (
         ("target_psnr", "None", problem.config.target_psnr),

@@ -1,4 +1,4 @@
-"""Where new Gaussians should go: matching pursuit on the error, many Gaussians in a round."""
+"""Matching pursuit: find the Gaussians to add to a render, many in each round."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from kcgs.optim import Objective, Renderer
 from .checks import regions_of
 from .state import FitState
 
-# Standard deviations that are tried, in pixels, by the side of the blocks that the residual is averaged over for them.
-# More of them, and smaller blocks, cost time, and descent changes them anyway.
+# Standard deviations of candidates, in pixels, by the side of the blocks over which the residual is averaged for them.
+# More sizes and smaller blocks cost time; descent changes the sizes anyway.
 _SIGMAS = {1: (0.7, 1.1), 2: (1.8, 2.9), 4: (4.7,), 8: (7.5,)}
 # reach of a filter, in standard deviations
 _REACH = 3.0
-# distance within which no other place gains more, in standard deviations
+# a local maximum has the largest gain within this distance, in standard deviations
 _RADIUS = 1.5
-# by which equal gains are made to differ
+# largest relative change of a gain that breaks ties
 _SCATTER = 1e-4
 _CUTOFF = 1e-4
 
 
 class _Scale(NamedTuple):
-    """Gains and colours of Gaussians of one size, each alone, at the middle of each block of images."""
+    """Gain and colour of a single Gaussian of one size, at the middle of each block of images."""
 
     sigma: float  # pixels
     block: int  # side of the blocks, pixels
-    gain: Tensor  # [B, h, w], fall of the squared error
-    colors: Tensor  # [B, C, h, w], of least squares
+    gain: Tensor  # [B, h, w], decrease of the squared error
+    colors: Tensor  # [B, C, h, w], least-squares solution
 
 
 def propose_gaussians(
@@ -47,21 +47,22 @@ def propose_gaussians(
 ) -> GaussianField:
     r"""Find the Gaussians to add to a render, for :meth:`kcgs.optim.GaussianAdam.append`.
 
-    Convention: they are round, and lower the squared error most. Alone, a Gaussian g lowers it by
-    :math:`\sum_c \langle g, e_c \rangle^2 / \langle g, g \rangle`, with products over pixels of its region. A round
-    adds the strongest local maxima of this gain over places and sizes; the next one begins with the error that is left.
-    Nothing is sampled at random. The strongest of each round come first.
+    Convention: the Gaussians are round, and lower the squared error most. A single Gaussian g lowers it by
+    :math:`\sum_c \langle g, e_c \rangle^2 / \langle g, g \rangle`, with products over the pixels of its region. A round
+    adds the strongest local maxima of this gain over positions and sizes; the next round starts from the remaining
+    error. Nothing is sampled at random. Rows are in the order of rounds, and in each round the strongest come first.
 
     Args:
-        error: image - render, :math:`(C, H, W)`, or of a batch, :math:`(B, C, H, W)`, floating.
-        num_gaussians: how many to find for each image, at least 1; there are fewer where no others lower the error.
-        regions: the RegionMap or label map of the render, of the error's size, for a batch one for all or one for each
-            image; each Gaussian gets the region under its centre. None: Gaussians are not confined.
+        error: image - render, :math:`(C, H, W)`, or a batch, :math:`(B, C, H, W)`, floating.
+        num_gaussians: how many Gaussians to find for each image, at least 1; the result has fewer if no others lower
+            the error.
+        regions: the RegionMap or label map of the render, of the error's size; a batch has one for all images or one
+            for each. Each Gaussian gets the region under its centre. None: Gaussians are not confined.
         backend: as in :func:`kcgs.functional.region_splat`.
 
     Returns:
-        A field, without a graph; a batch of them for :math:`(B, C, H, W)`, where rows of an image that finds fewer
-        than others have the colour 0.
+        A field, without a graph; a batch of fields for :math:`(B, C, H, W)`, padded with rows of the colour 0 for
+        images with fewer Gaussians.
 
     Raises:
         TypeError: an error that is no floating Tensor, or a number that is not whole.
@@ -85,26 +86,26 @@ def propose_gaussians(
 
 
 class _Proposals(NamedTuple):
-    """Gaussians of a batch, one after the other."""
+    """The Gaussians of all images of a batch in one list."""
 
-    image: Tensor  # [M], to which each belongs
+    image: Tensor  # [M], index of the image of each
     means: Tensor  # [M, 2]
     cholesky: Tensor  # [M, 3]
     colors: Tensor  # [M, C]
 
     def select(self, rows: Tensor) -> _Proposals:
-        """Return those of an index or a mask."""
+        """Return the Gaussians of an index or a mask."""
         return _Proposals(*(column[rows] for column in self))
 
     def by_image(self, batch: int) -> tuple[_Proposals, Tensor]:
-        """Return them in the order of images, and the place of each among those of its image."""
+        """Return the Gaussians in the order of images, and the rank of each within its image."""
         proposals = self.select(self.image.sort(stable=True)[1])
         counts = proposals.image.bincount(minlength=batch)
         firsts = counts.cumsum(0) - counts
         return proposals, torch.arange(len(proposals.image), device=counts.device) - firsts[proposals.image]
 
     def rows(self, batch: int) -> list[Tensor]:
-        """Return means, factors and colours of each image, (B, K, ...), where rows without a Gaussian have colour 0."""
+        """Return means, factors and colours, (B, K, ...), of each image, padded with rows of the colour 0."""
         proposals, place = self.by_image(batch)
         most = int(place.max()) + 1 if len(place) else 0
         tables = [
@@ -120,11 +121,11 @@ class _Proposals(NamedTuple):
 def propose(
     residual: Tensor, regions: RegionMap | None, count: int | Tensor, *, backend: str = "auto"
 ) -> GaussianField:
-    """Do what `propose_gaussians` does, with arguments that are checked; `count` may be 0, or of each image, (B,)."""
+    """Do what `propose_gaussians` does, with checked arguments; `count` may be 0, or (B,) with one for each image."""
     residual = residual.detach()
     is_batch, size = residual.ndim == 4, (residual.shape[-2], residual.shape[-1])
     residual = residual if is_batch else residual[None]
-    # below this the gain is rounding error: one pixel's, at the precision of the largest
+    # gains below this are rounding errors of one pixel of the largest error
     largest = residual.abs().amax((1, 2, 3)).double()
     floor = (128 * torch.finfo(residual.dtype).eps * largest).square()
     missing = torch.zeros_like(floor, dtype=torch.int64) + count
@@ -137,7 +138,7 @@ def propose(
         means, cholesky, colors = candidates.rows(batch)
         ids = None if regions is None else lookup_regions(means, regions.labels)
         rendered = region_splat(means, cholesky, colors, ids, regions, size=size, cutoff=_CUTOFF, backend=backend)
-        # Gaussians overlap: a step of the best length makes the fall of the error certain
+        # Gaussians overlap: a step of the best length is sure to lower the error
         length = _products(rendered, residual) / _products(rendered, rendered)
         is_useful = length > 0
         length = torch.where(is_useful, length, 0.0)
@@ -153,14 +154,14 @@ def propose(
 
 
 def _products(first: Tensor, second: Tensor) -> Tensor:
-    """Return the sum of the products of values, of each image."""
+    """Return the inner product of two batches for each image, (B,)."""
     pairs = zip(first.flatten(1), second.flatten(1), strict=True)
-    # on a CPU each image gets the bits that it gets alone
+    # on a CPU an image of a batch gets the same bits as a single image
     return torch.stack([a.dot(b) for a, b in pairs]) if first.is_cpu else (first * second).sum((1, 2, 3))
 
 
 def propose_for(objective: Objective, rendered: Tensor, renderer: Renderer, count: int | Tensor) -> GaussianField:
-    """Find at most `count` Gaussians that lower an objective of each render, (..., C, H, W), most: see `propose`."""
+    """Find the Gaussians, at most `count`, that lower the objective of each render, (..., C, H, W), most."""
     error, root = objective.residual(rendered)
     added = propose(error, renderer.regions, count, backend=renderer.backend)
     if isinstance(root, Tensor):
@@ -171,15 +172,15 @@ def propose_for(objective: Objective, rendered: Tensor, renderer: Renderer, coun
 
 
 def add_gaussians(state: FitState, count: int, fewer: Sequence[int] = ()) -> None:
-    """Add at most so many Gaussians to each image of a fit, if any, that lower its objective most.
+    """Add the Gaussians, at most `count`, that lower the objective of each image of a fit most.
 
-    In a batch an image gets Gaussians in place of its frozen rows, too. One with use for fewer than others gets rows of
-    the colour 0, which are frozen.
+    In a batch, new Gaussians also replace an image's frozen rows. Where an image can use fewer Gaussians than others,
+    the rest of its rows have the colour 0 and are frozen.
 
     Args:
         state: of the fit.
-        count: by which the number of rows may grow.
-        fewer: of each image, by how many less than others it gets; () where all get as many.
+        count: largest number of new rows.
+        fewer: for each image, how many Gaussians it gets fewer than `count`; () if all images get the same number.
     """
     if count <= 0:
         return
@@ -194,7 +195,7 @@ def add_gaussians(state: FitState, count: int, fewer: Sequence[int] = ()) -> Non
     optimizer.append(field, added)
     is_used = torch.cat([is_used, (added.colors.detach() != 0).any(-1)], 1)
     num_used = is_used.sum(1, keepdim=True)
-    # as many rows of each image, of the frozen ones the first
+    # keep the same number of rows of each image: those in use, and the first frozen rows
     is_kept = is_used | ((~is_used).cumsum(1) <= num_used.max() - num_used)
     if not bool(is_kept.all()):
         optimizer.keep(field, is_kept)
@@ -204,7 +205,7 @@ def add_gaussians(state: FitState, count: int, fewer: Sequence[int] = ()) -> Non
 
 
 def _strongest(residual: Tensor, regions: RegionMap | None, floor: Tensor, missing: Tensor) -> _Proposals:
-    """Return the strongest local maxima of each image, at most as many as it misses, the strongest first."""
+    """Return the strongest local maxima of each image, at most `missing`, (B,), the strongest first."""
     active = missing.nonzero()[:, 0]  # images
     index = None if regions is None else regions.index
     if index is not None and len(index) > 1:
@@ -217,12 +218,12 @@ def _strongest(residual: Tensor, regions: RegionMap | None, floor: Tensor, missi
 
 
 def _local_maxima(residual: Tensor, index: Tensor | None, floor: Tensor) -> tuple[Tensor, ...]:
-    """Return image, gain, mean, sigma and colours of each Gaussian that gains more than all others of any size nearby.
+    """Return image, gain, mean, sigma and colours of each Gaussian with the largest gain nearby, over all sizes.
 
     Args:
         residual: (B, C, H, W).
-        index: of each pixel's region, (B, H, W), or (1, H, W) for all images.
-        floor: gain from which on one counts, (B,).
+        index: region index of each pixel, (B, H, W), or (1, H, W) for all images.
+        floor: smallest gain that counts, (B,).
     """
     labels = None if index is None else index.to(residual.dtype)
     best, factors, block = torch.zeros_like(residual[:, 0]), _scatter(residual[0, 0]), 1
@@ -232,7 +233,7 @@ def _local_maxima(residual: Tensor, index: Tensor | None, floor: Tensor) -> tupl
         scale.gain.mul_(_middles(factors, scale.block))
         torch.maximum(middles, scale.gain, out=middles)
         scales.append(scale)
-        # in a region of one pixel all sizes are the same: the first counts
+        # in a region of one pixel all sizes gain the same: the first wins
         factors.mul_(1.0 - _SCATTER)
     for sigma, side, gain, colors in scales:
         while block < side:
@@ -247,7 +248,7 @@ def _local_maxima(residual: Tensor, index: Tensor | None, floor: Tensor) -> tupl
 
 
 def _scales(residual: Tensor, labels: Tensor | None) -> Iterator[_Scale]:
-    """Evaluate each size of Gaussians, as long as the images have a block of it."""
+    """Evaluate each size of Gaussians whose blocks are not larger than the images."""
     pixels = torch.cat([residual, torch.ones_like(residual[:, :1])], 1)
     for block, sigmas in _SIGMAS.items():
         if min(residual.shape[2:]) < block:
@@ -260,8 +261,8 @@ def _scales(residual: Tensor, labels: Tensor | None) -> Iterator[_Scale]:
 
 
 def _scatter(plane: Tensor) -> Tensor:
-    """Return factors of almost 1 that differ from place to place, so that maxima of a flat error lie apart."""
-    # the fractions of their sums are a sequence of low discrepancy: any few of the largest are spread over the plane
+    """Return factors just below 1 that differ between pixels, so that maxima of a flat error lie apart."""
+    # steps of a sequence of low discrepancy: the pixels with the largest factors are spread over the plane
     row, column = (
         (step * torch.arange(length, device=plane.device, dtype=torch.float64)).frac().to(plane.dtype)
         for step, length in zip((0.7548776662466927, 0.5698402909980532), plane.shape, strict=True)
@@ -270,15 +271,15 @@ def _scatter(plane: Tensor) -> Tensor:
 
 
 def _middles(planes: Tensor, block: int) -> Tensor:
-    """Return the view of the pixel in the middle of each whole block of (..., H, W), of four the last."""
+    """Return a view of the middle pixel of each whole block of (..., H, W): the last of the four around the middle."""
     height, width = (length // block * block for length in planes.shape[-2:])
     return planes[..., block // 2 : height : block, block // 2 : width : block]
 
 
 def _average(planes: Tensor, labels: Tensor | None, block: int) -> Tensor:
-    """Return the means of whole blocks of (B, K, H, W), whose side is a power of 2.
+    """Return the means of whole blocks of (B, K, H, W); their side is a power of 2.
 
-    Of a block that a contour crosses, pixels that differ in label from its middle count as 0.
+    Pixels whose label differs from that of the block's middle count as 0.
     """
     if labels is not None and block > 1:
         if planes.is_cpu:
@@ -298,10 +299,11 @@ def _average(planes: Tensor, labels: Tensor | None, block: int) -> Tensor:
 def _evaluate(planes: Tensor, labels: Tensor | None, sigma: float) -> tuple[Tensor, Tensor]:
     """Return gain (B, H, W) and colours of Gaussians at the pixels of planes, (B, C + 1, H, W).
 
-    The last plane has the pixels' weights. Filters run along columns, then along rows, each time over the pixels of the
-    same label alone. So a Gaussian sees those of its region that it reaches by a column and a row.
+    The last plane has the pixels' weights. Filters run along columns, then along rows, each over pixels of the same
+    label only. So a Gaussian covers a pixel of its region only if the pixel of that column in the
+    Gaussian's row is in the region too.
     """
-    # the square of a Gaussian is one, too, narrower by sqrt 2
+    # the square of a Gaussian is a Gaussian with sigma / sqrt(2)
     arguments = planes, labels, sigma, sigma / math.sqrt(2.0), math.ceil(_REACH * sigma)
     if not takes_triton(planes):
         from .pursuit_loops import evaluate  # loads numba
@@ -327,7 +329,7 @@ def _pool(planes: Tensor, radius: int) -> Tensor:
 
 
 def _halve_by_maximum(planes: Tensor) -> Tensor:
-    """Return the largest value, none negative, of each block of 2 x 2, of which the last may have less."""
+    """Return the largest value of each block of 2 x 2; no value is negative, and the last blocks may be smaller."""
     planes = pad(planes, [0, planes.shape[2] % 2, 0, planes.shape[1] % 2])
     rows = torch.maximum(planes[:, ::2], planes[:, 1::2])
     return torch.maximum(rows[..., ::2], rows[..., 1::2])

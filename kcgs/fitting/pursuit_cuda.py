@@ -8,18 +8,18 @@ from torch import Tensor
 
 from kcgs.kernels.cuda.triton_function import triton_function
 
-# pixels of a program
+# pixels per program
 _PIXELS = 512
 
 
 def blur(planes: Tensor, labels: Tensor | None, sigma: float, norm_sigma: float, reach: int) -> Tensor:
-    """Filter planes of images along columns, then along rows, each time over the pixels of the same label alone.
+    """Filter planes of images along columns, then along rows, each time over pixels of the same label only.
 
     Args:
         planes: (B, K, H, W), contiguous float32, on a CUDA device.
-        labels: (B, H, W), or (1, H, W) for all images, contiguous; None: all pixels are of one.
+        labels: (B, H, W), or (1, H, W) for all images, contiguous; None: all pixels have the same label.
         sigma: standard deviation of the filter, in pixels.
-        norm_sigma: that of the last plane's.
+        norm_sigma: standard deviation of the last plane's filter, in pixels.
         reach: of both filters, in pixels.
     """
     batch, count, height, width = planes.shape
@@ -27,7 +27,7 @@ def blur(planes: Tensor, labels: Tensor | None, sigma: float, norm_sigma: float,
     for stride, length in ((width, height), (1, width)):
         blurred = torch.empty_like(planes)
         with torch.cuda.device_of(planes):
-            # without labels any address will do: it is not read
+            # without labels the kernel reads none: any address is valid
             _blur(
                 (-(-area // _PIXELS), count, batch),
                 planes, planes if labels is None else labels, blurred, area, stride, length,

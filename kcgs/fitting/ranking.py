@@ -1,4 +1,4 @@
-"""The order of Gaussians by what they add to a render."""
+"""The order of Gaussians by their importance for a render."""
 
 from __future__ import annotations
 
@@ -11,24 +11,25 @@ from kcgs.optim import self_product
 
 from .removal import check_gaussians
 
-# more are slower, and order Gaussians that overlap better
+# more rounds are slower, and order overlapping Gaussians better
 _ROUNDS = 16
 
 
 @torch.no_grad()
 def rank_gaussians(field: GaussianField, regions: RegionMap | Tensor | None = None, *, backend: str = "auto") -> Tensor:
-    r"""Order Gaussians by what they add to the render, so that for any K the first K show it well.
+    r"""Order Gaussians by importance, so that for any K the first K approximate the render well.
 
-    Convention: from the whole render Gaussians are taken away in 16 rounds, each time those that, each alone, raise the
-    squared error least; the last ones come first. Rows of the colour 0 come last.
+    Convention: Gaussians are removed from the whole render in 16 rounds. Each round removes the Gaussians whose single
+    removal raises the squared error least. Gaussians that are removed later come earlier; rows of the colour 0 come
+    last.
 
     Args:
         field: N Gaussians of an image, or of each image of a batch, without opacities.
         regions: as in :func:`lowest_impact`.
-        backend: as there.
+        backend: as in :func:`lowest_impact`.
 
     Returns:
-        The rows, the most important first, int64, :math:`(N)` or :math:`(B, N)`.
+        The row numbers, the most important first, int64, :math:`(N)` or :math:`(B, N)`.
 
     Raises:
         TypeError, ValueError: as :func:`lowest_impact`.
@@ -46,7 +47,7 @@ def rank_gaussians(field: GaussianField, regions: RegionMap | Tensor | None = No
     order = torch.empty_like(energy[..., :0], dtype=torch.int64)
     is_left = torch.ones_like(energy, dtype=torch.bool)
     while order.shape[-1] < energy.shape[-1]:
-        # half the gradient of the error of a black render by a colour: the inner product with it, with the other sign
+        # colour gradients of a black render against the error: inner products of each Gaussian with the error, negated
         products = renderer.squared_error_gradients(black, error).colors
         rise = energy - 2.0 * (products * colors).sum(-1)
         rise = torch.where(energy > 0, rise, torch.finfo(rise.dtype).min).masked_fill(~is_left, torch.inf)

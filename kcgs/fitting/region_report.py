@@ -13,9 +13,9 @@ from kcgs.scene import Scene, empty_regions
 
 @dataclass(frozen=True)
 class RegionReport:
-    """What became of the regions of a label map; as text, one line.
+    """What became of the regions of a label map; its text is one line.
 
-    `num_before` is the sum of `num_after` and of the merged regions, unless the map was dropped as a whole.
+    `num_before` is `num_after` plus the merged regions, unless the whole map was dropped.
 
     Example:
         >>> print(RegionReport(num_before=40, num_after=28, merged_for_count=10, merged_for_bytes=2))
@@ -25,11 +25,11 @@ class RegionReport:
     num_before: int
     """Regions of the user's map."""
     num_after: int
-    """Regions of the scene; 1: it has no map."""
+    """Regions of the scene; 1: the scene has no map."""
     merged_for_count: int = 0
-    """Regions that were merged into others since there were more than Gaussians."""
+    """Regions that were merged into others because there were more regions than Gaussians."""
     merged_for_bytes: int = 0
-    """Regions that were merged since their contours save less error than Gaussians of the same bytes."""
+    """Regions that were merged because their contours save less error than Gaussians of the same bytes."""
     dropped: Literal["recipe", "bytes"] | None = None
     """Why the map is not used: the recipe has no guidance, or Gaussians of the map's bytes save more error."""
     moved_pixels: int = 0
@@ -37,7 +37,7 @@ class RegionReport:
     empty: int = 0
     """Regions of the scene without a Gaussian: they are black."""
     empty_pixels: int = 0
-    """Pixels of the image that are most of all theirs."""
+    """Pixels of these empty regions."""
 
     def __str__(self) -> str:
         if self.dropped is not None:
@@ -80,7 +80,7 @@ def report_regions(
 
 
 def _moved_pixels(original: RegionMap, regions: RegionMap) -> int:
-    """Count the pixels outside the region that theirs became: the one of its id, or that of most of its pixels."""
+    """Count pixels that left their region's successor: the region of the same id, else that of most of its pixels."""
     before, after, count = original.index.flatten().long(), regions.index.flatten().long(), regions.num_regions
     into = regions.index_of(original.ids)
     pairs, shared = (before * count + after).unique(return_counts=True)

@@ -1,4 +1,4 @@
-"""Removal of the Gaussians that cost least."""
+"""Removal of the Gaussians with the lowest impact on the render."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from .state import FitState
 def lowest_impact(
     field: GaussianField, num_gaussians: int, regions: RegionMap | Tensor | None = None, *, backend: str = "auto"
 ) -> tuple[Tensor, Tensor]:
-    r"""Find the Gaussians that cost least to remove, for :meth:`kcgs.optim.GaussianAdam.keep`.
+    r"""Find the Gaussians whose removal changes the render least, for :meth:`kcgs.optim.GaussianAdam.keep`.
 
     Convention: the impact of Gaussian i is :math:`|c_i|^2 \langle g_i, g_i \rangle / (1 + \sum_j o_{ij})`. The overlap
-    :math:`o_{ij}` is the normalised inner product of two Gaussians of half the covariances: 1 for twins, and near 0 for
-    distant ones. Of the Gaussians that are not black only the half with more energy count as j, for others may be
-    removed as well. The other colours take one gradient step towards the render of what is removed, scaled by each
-    one's energy and overlaps, and of the best length.
+    :math:`o_{ij}` is the normalised inner product of both Gaussians with half their covariances: 1 for identical
+    Gaussians, near 0 for distant ones. Only the half of the Gaussians with more energy count as j, since the others may
+    be removed too; black Gaussians never count. The remaining colours take one gradient step, of the best length,
+    towards the render of the removed Gaussians; it is scaled by the energy and overlaps of each Gaussian.
 
     Args:
         field: N Gaussians of an image, or of each image of a batch, without opacities.
-        num_gaussians: how many to remove of each image, from 0 to N.
-        regions: the RegionMap or label map of the field's size, if Gaussians are confined; for a batch one for all or
-            one for each image.
+        num_gaussians: how many to remove from each image, from 0 to N.
+        regions: the RegionMap or label map of the field's size, if Gaussians are confined; a batch has one for all
+            images or one for each.
         backend: as in :func:`kcgs.functional.region_splat`.
 
     Returns:
-        A mask of those to remove, boolean :math:`(N)` or :math:`(B, N)`, and the colours of all, :math:`(N, C)` or
-        :math:`(B, N, C)`: the others stand in for them.
+        A mask of the Gaussians to remove, boolean :math:`(N)` or :math:`(B, N)`, and new colours of all Gaussians,
+        :math:`(N, C)` or :math:`(B, N, C)`, which make up for the removal.
 
     Raises:
         TypeError: no field, or a number that is not whole.
@@ -74,7 +74,7 @@ def check_gaussians(
 def lowest_weighted_impact(
     renderer: Renderer, gaussians: Gaussians, count: int, weight: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Do what `lowest_impact` does, by a weight of the squared error of each Gaussian, (N,) or (B, N)."""
+    """Do what `lowest_impact` does, with the squared error weighted for each Gaussian, (N,) or (B, N)."""
     _, cholesky, colors, _ = gaussians
 
     def products(cholesky: Tensor, colors: Tensor) -> Tensor:
@@ -90,21 +90,21 @@ def lowest_weighted_impact(
     removed = _lowest(energy / crowding[..., 0], count)
     removed_products = products(cholesky, colors * removed[..., None])
     step = removed_products / (area * crowding) * ~removed[..., None]
-    # inner products of the step's render, with what is removed and with itself
+    # inner products of the step's render: with itself, and with the removed render
     square = (step * products(cholesky, step)).sum((-2, -1), keepdim=True)
     length = (step * removed_products).sum((-2, -1), keepdim=True) / square.clamp_min(torch.finfo(step.dtype).tiny)
     return removed, colors + length * step
 
 
 def _lowest(values: Tensor, count: int | Tensor) -> Tensor:
-    """Mark the lowest values of each image, so many, or (..., 1) of each; of equal ones the first."""
+    """Mark the `count` lowest values of each image, an int or (..., 1); among equal values the first."""
     order, places = values.argsort(stable=True), torch.arange(values.shape[-1], device=values.device)
     return torch.zeros_like(values, dtype=torch.bool).scatter_(-1, order, (places < count).expand_as(order))
 
 
 @torch.no_grad()
 def remove_gaussians(state: FitState, count: int) -> None:
-    """Remove so many Gaussians, if any, those with the lowest impact."""
+    """Remove the `count` Gaussians with the lowest impact; none for a count of 0 or less."""
     if count <= 0:
         return
     gaussians, cutoff = Gaussians.of(state.field), draft_cutoff(state.problem.config.cutoff)

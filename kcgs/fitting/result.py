@@ -1,4 +1,4 @@
-"""What a fit returns."""
+"""The result of a fit."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 class HistoryEntry(NamedTuple):
     """One point of the curve of error against run time.
 
-    Of a batch loss, PSNR and EF-PSNR are means over its images, without those that diverged; EF-PSNR also without those
+    For a batch, loss, PSNR and EF-PSNR are means over the images, without diverged images; EF-PSNR also without images
     that have no contour. The PSNR of an image without error is infinite, and so is the mean.
 
-    EF-PSNR is taken along the contours of the user's map, wherever the fit moves them: those of the scene's map are
-    what :func:`kcgs.evaluate` looks at by default. NaN without contours.
+    EF-PSNR is measured along the contours of the user's map, wherever the fit moves them; NaN without contours.
+    :func:`kcgs.evaluate` measures along the contours of the scene's map by default.
     """
 
     iteration: int
@@ -37,34 +37,34 @@ class HistoryEntry(NamedTuple):
 
 
 class FitResult(NamedTuple):
-    """What a fit returns."""
+    """The scene of a fit, its history, and why it ended."""
 
     scene: Scene
-    """Without regions where nothing is confined; a batch for a batch of images, with as many rows for each image: rows
-    that one has no use for have the colour 0."""
+    """Without regions if nothing is confined. For a batch of images a batch, with the same number of rows for each
+    image: rows that an image does not need have the colour 0."""
     history: list[HistoryEntry]
-    """Its EF-PSNR is along the contours of the user's map, not of the scene's; see :class:`HistoryEntry`."""
+    """Its EF-PSNR is measured along the contours of the user's map, not of the scene's: see :class:`HistoryEntry`."""
     stop_reason: str
-    """iterations, seconds, target_psnr, callback or diverged; or what an event of yours returned."""
+    """One of iterations, seconds, target_psnr, callback, diverged; or the string that your event returned."""
     config: FitConfig
     num_pruned: int | Tensor = 0
-    """Gaussians that were removed at the end since they changed the render by next to nothing; of a batch (B,)."""
+    """Number of Gaussians that were removed at the end because they hardly changed the render; (B,) for a batch."""
     prune_error: float | Tensor = 0.0
-    """No value of the render changed by more when they were; of a batch (B,)."""
+    """Largest change of a value of the render by this removal; (B,) for a batch."""
     regions: RegionReport | list[RegionReport] | None = None
-    """What became of the label map, or of that of each image of a batch; None without one."""
+    """What became of the label map, or of the map of each image of a batch; None without a map."""
     seconds: float = 0.0
     """Wall time from the start to the pruned scene, without compilation; a search counts all its fits."""
     psnr: float | Tensor = math.nan
-    """Of the scene before pruning, in dB; of a batch (B,), on the CPU; NaN without an image."""
+    """PSNR of the scene before pruning, in dB; (B,) on the CPU for a batch; NaN without an image."""
 
     diverged: tuple[int, ...] = ()
-    """Images whose numbers overflowed; their scenes are the best of before."""
+    """Images whose numbers overflowed; they keep their best scene from before."""
 
     def of_image(self, index: int) -> FitResult:
-        """Return the result of one image of a batch: its scene, without rows of the colour 0, PSNR and report.
+        """Return the result of one image of a batch: its scene without rows of the colour 0, its PSNR and its report.
 
-        The history stays that of the batch.
+        The history is still that of the batch.
 
         Example:
             >>> from kcgs import fit
@@ -91,6 +91,6 @@ class FitResult(NamedTuple):
         return self.scene._repr_png_()
 
     def plot(self) -> Figure:
-        """Plot PSNR and EF-PSNR against run time and iterations; save it with its `savefig`."""
+        """Plot PSNR and EF-PSNR against run time and iterations; the figure's `savefig` saves it."""
         figure: Figure = history_figure(self.history)
         return figure

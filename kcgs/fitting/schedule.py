@@ -1,4 +1,4 @@
-"""The events of a fit that change its scene, by its settings."""
+"""The events that change the scene of a fit, as its settings ask for."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""The fewest Gaussians that reach a PSNR: a secant search over their number, by finished fits.
+"""Search for the fewest Gaussians that reach a PSNR: a secant search in which each trial is a whole fit.
 
-Every fit but the first goes on from the fit with the nearest number, with some Gaussians more or without those of the
-lowest impact.
+Every fit but the first continues the fit with the nearest number of Gaussians: some are added, or those of the lowest
+impact are removed.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from .state import FitState
 
 # pixels per Gaussian of the first fit
 _FIRST_SPACING = 256
-# PSNR in dB that twice as many Gaussians add, on photos
+# expected gain in PSNR for twice as many Gaussians, in dB, on photos
 _DECIBELS_PER_OCTAVE = 3.0
-# the search ends where so many times fewer Gaussians are too few
+# the search ends when the numbers of Gaussians that are enough and too few have at most this ratio
 _PRECISION = 1.04
-# or where the curve says that so many times fewer would be enough
+# or when the curve expects to save less than this ratio
 _EXPECTED_PRECISION = 1.025
-# share of a fit from which on another one goes on
+# share of the schedule at which a continued fit starts
 _WARM_START = 0.6
 
 Run = Callable[[FitState], FitResult]
@@ -46,10 +46,9 @@ class _Trial(NamedTuple):
 
 
 def search(problem: Problem, run: Run) -> FitResult:
-    """Return the fit with the fewest Gaussians, at most N, that reaches `target_psnr`, else the best.
+    """Return the fit with the fewest Gaussians, at most N, that reaches `target_psnr`, else the fit with most PSNR.
 
-    `run` takes a fit from its state to its end. Where the clock ends the search, the result is that of the best fit so
-    far.
+    `run` runs a fit from its state to its end. If the clock ends the search, the best fit so far is returned.
     """
     clock, target = Clock(), problem.config.target_psnr
     assert target is not None
@@ -69,7 +68,7 @@ def search(problem: Problem, run: Run) -> FitResult:
 
 
 def _fit(problem: Problem, count: int, trials: list[_Trial], seconds: float, run: Run) -> _Trial:
-    """Fit so many Gaussians, from the start or from the nearest trial."""
+    """Fit `count` Gaussians, from the start or from the nearest trial."""
     config = problem.config
     changes = {
         "target_psnr": None,
@@ -87,13 +86,13 @@ def _fit(problem: Problem, count: int, trials: list[_Trial], seconds: float, run
 
 
 def _can_go_on(problem: Problem, trial: _Trial) -> bool:
-    """Whether a fit may go on from a trial, whose regions are merged for its own number of Gaussians."""
+    """Whether a fit may continue a trial: the regions of a trial may be merged for another number of Gaussians."""
     is_merged = problem.config.merge_regions and problem.num_excess_regions != trial.state.problem.num_excess_regions
     return trial.result.stop_reason != "diverged" and trial.state.optimizer.keeps_averages and not is_merged
 
 
 def _warm_start(problem: Problem, finished: FitState) -> FitState:
-    """Return the state of a fit that goes on from another with some Gaussians more or fewer."""
+    """Return the state of a fit that continues another fit with more or fewer Gaussians."""
     count, field = problem.num_gaussians, copy.deepcopy(finished.field)
     state = make_state(
         problem, field, finished.regions, count, anchor=finished.anchor, num_additions=finished.num_additions,
@@ -126,6 +125,6 @@ def _next_count(trials: list[_Trial], target: float, most: int) -> int | None:
     if high.num_gaussians == 1 or octaves < math.log2(_EXPECTED_PRECISION):
         return None
     expected: float = high.num_gaussians / 2.0**octaves
-    if low is not None:  # on a curve that bends, the secant stays at one end
+    if low is not None:  # a plain secant of a bent curve would converge from one side only
         expected = math.sqrt(expected * math.sqrt(low.num_gaussians * high.num_gaussians))
     return min(max(round(expected), 1 if low is None else low.num_gaussians + 1), high.num_gaussians - 1)

@@ -26,7 +26,7 @@ _INITIALIZERS = {"uniform": uniform_field, "random": random_field}
 def start(problem: Problem) -> FitState:
     """Return the state of a fit at its start."""
     regions, first = _regions_to_render(problem), math.ceil(problem.config.densify_from * problem.num_gaussians)
-    # a Gaussian for each region of an image, as far as there may be
+    # at least one Gaussian for each region of an image, but at most N
     num_regions = [1] * problem.num_images if regions is None else regions_per_map(regions)
     counts = [min(problem.num_gaussians, max(first, count)) for count in num_regions]
     field = _initial_field(problem, regions, counts)
@@ -39,7 +39,7 @@ def start(problem: Problem) -> FitState:
 
 
 def _initial_field(problem: Problem, regions: RegionMap | None, counts: list[int]) -> GaussianField:
-    """Return so many Gaussians for each image; images with fewer than others have rows of the colour 0 at the end."""
+    """Return `counts` Gaussians of the images, padded at the end with rows of the colour 0."""
     initialize = problem.objects.initializer or _INITIALIZERS[problem.config.initializer]
     images, most = problem.canvas, max(counts)
 
@@ -59,7 +59,7 @@ def _initial_field(problem: Problem, regions: RegionMap | None, counts: list[int
 def make_state(
     problem: Problem, field: GaussianField, regions: RegionMap | None, num_initial: int, **progress: Any
 ) -> FitState:
-    """Return the state of a fit of a field that began with so many Gaussians."""
+    """Return the state of a fit of a field that began with `num_initial` Gaussians."""
     config, optimizer = problem.config, make_optimizer(problem, field, initial_sigma(problem.size, num_initial))
     cutoff = draft_cutoff(config.cutoff) if optimizer.has_drafts else config.cutoff
     return FitState(
@@ -74,7 +74,7 @@ def make_state(
 
 
 def _regions_to_render(problem: Problem) -> RegionMap | None:
-    """Return the map of each image to render with; None where no image has more than one region."""
+    """Return the map of each image to render with; None if no image has more than one region."""
     if problem.regions is None or not problem.config.guidance:
         return None
     maps = map_of_each(problem.regions, problem.num_images)
@@ -83,13 +83,13 @@ def _regions_to_render(problem: Problem) -> RegionMap | None:
 
 
 def _map_to_render(image: Tensor, regions: RegionMap, problem: Problem) -> RegionMap:
-    """Return the map of an image with softness, and with at most as many regions as Gaussians where regions merge."""
+    """Return the map of an image with its softness, merged to at most N regions if the settings merge regions."""
     config, count = problem.config, problem.num_gaussians
     if config.merge_regions and regions.num_regions > count:
-        # until each region can have a Gaussian: others would be black
+        # each region needs a Gaussian: without one it would be black
         merged, ids = regions.merge(pairs_to_merge(image, regions.labels, count))
         regions = RegionMap(ids[:1].expand(regions.size)) if merged is None else merged
-    # a map with softness of its own knows how sharp its contours are
+    # the map's own softness takes precedence over the settings
     if regions.num_regions == 1 or regions.softness != 0.0 or config.softness == 0.0:
         return regions
     if config.softness != "auto":
@@ -98,6 +98,6 @@ def _map_to_render(image: Tensor, regions: RegionMap, problem: Problem) -> Regio
 
 
 def with_chosen_softness(image: Tensor, regions: RegionMap) -> RegionMap:
-    """Return a map of an image with the softness of each contour that explains the image best."""
+    """Give each contour of a map the softness that explains the image best."""
     labels = regions.labels.cpu()
     return RegionMap.from_labels(labels, choose_softness(image, labels)).to(image.device)

@@ -1,4 +1,4 @@
-"""The state of a fit, and what happens to it when a scene was measured."""
+"""The state of a fit, and the measurements that it records."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from .best import Best
 from .problem import Problem
 from .result import HistoryEntry
 
-# numbers beyond it have diverged: the renderer takes no such centre
+# larger numbers count as diverged: the renderer does not accept such centres
 LARGEST = MEAN_LIMIT
 
 
 @dataclass(kw_only=True, repr=False)
 class FitState(FieldState):
-    """A fit in progress: the start fills it, events and steps change it, a checkpoint keeps it."""
+    """A fit in progress: `start` makes it, events and steps change it, a checkpoint stores it."""
 
     problem: Problem
     anchor: RegionMap | None
@@ -33,22 +33,22 @@ class FitState(FieldState):
     num_initial: int
     """Rows at the start."""
     initial_counts: list[int] = field(default_factory=list)
-    """Gaussians of each image at the start, where some have fewer than `num_initial`; else empty."""
+    """Gaussians of each image at the start, if some images have fewer than `num_initial`; else empty."""
     num_requested: int
-    """Gaussians of each image that the schedule last asked for; fewer exist where fewer were of use."""
+    """Gaussians per image that the schedule last asked for; an image has fewer where more did not lower its error."""
     num_additions: int = 0
     """How often Gaussians were added."""
     num_cycles: int = 0
-    """Cycles of removals and additions; 0 while the number of Gaussians still grows."""
+    """Planned cycles of removals and additions; 0 while the number of Gaussians still grows."""
     num_late_moves: int = 0
     """How often contours moved after densification."""
     contour_seconds: list[float] = field(default_factory=list)
     """Seconds that each move of the contours took, in a fit with a clock."""
     history: list[HistoryEntry] = field(default_factory=list)
     best: Best | None = None
-    """The best scene of each image that was measured."""
+    """The best measured scene of each image."""
     diverged: list[int] = field(default_factory=list)
-    """Images whose numbers were not finite; they keep the best of before."""
+    """Images whose numbers overflowed; they keep their best scene from before."""
 
     def __repr__(self) -> str:
         return f"FitState(iteration {self.iteration}, progress {self.progress:.2f}, {self.scene!r})"
@@ -60,16 +60,16 @@ class FitState(FieldState):
 
     @property
     def num_gaussians(self) -> int:
-        """Gaussians of each image at the moment, with those that have the colour 0."""
+        """Current rows of each image, including rows of the colour 0."""
         return self.field.num_gaussians
 
     @property
     def is_draft(self) -> bool:
-        """True where the cutoff is not yet that of the result."""
+        """True while the cutoff is still the draft cutoff."""
         return self.renderer.cutoff != self.problem.config.cutoff
 
     def overflowing_images(self) -> list[int]:
-        """Return the images of which a number is not finite, or too large."""
+        """Return the images with a number that is not finite or too large."""
         tables = [self.field.means, self.field.cholesky, self.field.colors]
         if is_within(tables, LARGEST):
             return []
@@ -77,7 +77,7 @@ class FitState(FieldState):
 
     @property
     def expected_iterations(self) -> float:
-        """About how many iterations the fit will take."""
+        """Expected number of iterations of the whole fit."""
         config = self.problem.config
         if config.max_seconds is None:
             return config.planned_iterations
@@ -85,14 +85,14 @@ class FitState(FieldState):
 
     @property
     def all_diverged(self) -> bool:
-        """True where no image is left."""
+        """True if every image diverged."""
         return len(self.diverged) == self.problem.num_images
 
     @torch.no_grad()
     def exclude(self, images: list[int]) -> None:
-        """Give images that overflow Gaussians of the colour 0, which stay, unless no other image is left.
+        """Mark overflowing images as diverged, with a warning.
 
-        They count as diverged from here on; a warning says so.
+        If other images are left, the Gaussians of diverged images get the colour 0 and are frozen.
         """
         if new := [image for image in images if image not in self.diverged]:
             self.diverged += new
@@ -114,25 +114,25 @@ class FitState(FieldState):
 
 
 class Measurement(NamedTuple):
-    """Scenes that were rendered, and when."""
+    """The scenes of a render, and when they were rendered."""
 
     iteration: int
     seconds: float
     scene: Scene  # a copy, since the fit goes on
     is_draft: bool
-    excluded: list[int]  # images of it that had diverged
+    excluded: list[int]  # images that had diverged
 
 
 class Errors(NamedTuple):
-    """Mean errors of a render of each image, (B,)."""
+    """Mean errors of the render of each image, (B,)."""
 
     objective: Tensor
-    squared: Tensor  # once it is clipped to [0, 1]; NaN without an image
-    squared_near_contours: Tensor  # the same in the band of EF-PSNR; NaN without contours
+    squared: Tensor  # of the render clipped to [0, 1]; NaN without an image
+    squared_near_contours: Tensor  # the same over the band of EF-PSNR; NaN without contours
 
 
 def record(state: FitState, measurement: Measurement, errors: Errors) -> None:
-    """Put a measurement into the history, and keep the scenes that are the best; those of NaN do not count."""
+    """Append a measurement to the history, and keep the best scene of each image; NaN errors do not count."""
     iteration, seconds, scene, is_draft, excluded = measurement
     errors = Errors(*(column.to("cpu", torch.float64, copy=True) for column in errors))
     for column in errors:

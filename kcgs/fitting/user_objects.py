@@ -1,4 +1,4 @@
-"""What users pass in place of the names of a recipe: a loss, first Gaussians, an event that adds some, an optimizer."""
+"""A user's own loss, initializer, densifying event and optimizer, in place of the names of a recipe."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from kcgs.nn import GaussianField
 from kcgs.optim import Event, Loss
 
 Initializer = Callable[[Tensor, int, RegionMap | None, int], GaussianField]
-# of an optimizer beside its methods
+# members of an optimizer that a fit reads, besides its methods
 _FIT_MEMBERS = ("rate", "has_drafts", "keeps_averages")
 
 
@@ -21,8 +21,8 @@ _FIT_MEMBERS = ("rate", "has_drafts", "keeps_averages")
 class Densifier(Event, Protocol):
     """An event that adds Gaussians to a fit: the argument `densify` of :func:`kcgs.fit`.
 
-    ``act(state)`` is called before every step with the :class:`FitState`. It returns at once, unless it is time by
-    ``state.progress``. A reason, a string, ends the fit.
+    ``act(state)`` is called before every step with the :class:`FitState`. It decides by ``state.progress`` whether to
+    add Gaussians. If it returns a string, the fit ends with this reason.
 
     Example:
         >>> import torch
@@ -41,26 +41,26 @@ class Densifier(Event, Protocol):
 
     @property
     def end(self) -> float:
-        """Share of the fit at its last addition; after it contours move a few times on their own."""
+        """Share of the fit at the last addition; afterwards contours still move a few times."""
 
 
 class UserObjects(NamedTuple):
-    """Arguments of a fit that no file keeps; None where the settings have a name."""
+    """Arguments of a fit that a checkpoint cannot store; None where the settings have a name instead."""
 
     objective: Loss | None = None
-    """From a render, (1, C, H, W), to a scalar."""
+    """Function from a render, (1, C, H, W), to a scalar."""
     initializer: Initializer | None = None
-    """From images, (B, C, H, W), N, a map or None, and a seed to a batch of fields."""
+    """Function from images, (B, C, H, W), a number of Gaussians, a map or None, and a seed to a batch of fields."""
     densify: Densifier | None = None
     optimizer: Callable[[GaussianField], Any] | None = None
-    """Returns an optimizer with the methods of GaussianAdam."""
+    """Function from a field to an optimizer with the methods of GaussianAdam."""
 
 
 NO_OBJECTS = UserObjects()
 
 
 def split_names(**arguments: object) -> tuple[dict[str, Any], UserObjects]:
-    """Split the arguments of a fit into settings, by name, and objects of the user's."""
+    """Split the arguments of a fit into settings (names) and the user's objects."""
     settings: dict[str, Any] = {
         name: value for name, value in arguments.items() if isinstance(value, str) and name != "densify"
     }
@@ -79,7 +79,7 @@ def split_names(**arguments: object) -> tuple[dict[str, Any], UserObjects]:
 
 
 def check_initial(field: object, images: Tensor, num_gaussians: int, regions: RegionMap | None) -> GaussianField:
-    """Return what an initializer returned, if it is a field of so many Gaussians for each of the images."""
+    """Validate an initializer's field: `num_gaussians` Gaussians for each of the images."""
     batch, channels, *size = images.shape
     expected = _layout((batch, num_gaussians, channels), tuple(size), regions is not None)
     received = type(field).__name__
@@ -95,7 +95,7 @@ def _layout(colors: tuple[int, ...], size: tuple[int, ...], has_ids: bool) -> st
 
 
 def check_optimizer(optimizer: Any) -> Any:
-    """Return a user's optimizer, if it has what a fit reads from it beside its methods."""
+    """Validate that a user's optimizer has the members that a fit reads."""
     if missing := [name for name in _FIT_MEMBERS if not hasattr(optimizer, name)]:
         expected = f"a function that returns an optimizer with {', '.join(_FIT_MEMBERS)}"
         raise InvalidArgument("optimizer", expected, f"{type(optimizer).__name__} without {', '.join(missing)}")

@@ -1,4 +1,4 @@
-"""Files in which bits are traded for error: from a scene and its image, or from an image alone."""
+"""Rate-distortion optimized files: from a scene and its image, or from an image alone."""
 
 from .budget import FitBytesResult, fit_bytes
 from .compress import Compressed, compress, quality_for

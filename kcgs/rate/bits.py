@@ -1,4 +1,4 @@
-"""The bits of Gaussians as a differentiable function of their parameters, for a descent that lowers them."""
+"""An estimate of the bits of Gaussians, differentiable in their parameters."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from torch import Tensor
 
 from kcgs.codec import OPPONENT, Quantizer
 
-# pixels: a Gaussian whose standard deviations have a smaller product costs as many bits as one of this product; sums
-# over pixel centres are nothing like integrals there
+# least product of the two standard deviations, in square pixels: smaller Gaussians count as Gaussians of this size,
+# since for them sums over pixel centres differ from integrals
 _MIN_SIGMA_PRODUCT = 0.25
 
 
 def soft_bits(cholesky: Tensor, colors: Tensor, quantizer: Quantizer) -> Tensor:
     r"""Estimate the bits of each Gaussian, (N,), up to a constant, differentiably.
 
-    A number whose steps add the distortion D each (docs/format.md) has about :math:`\sqrt{1 + e / D}` of them, with e
-    what a change of its whole range would add:
+    A number with steps that add the distortion D (docs/format.md) has about :math:`\sqrt{1 + e / D}` steps, where e is
+    the error of a change by its whole range:
 
     .. math:: 2 b = 2 \log_2(1 + \pi |c|^2 / D) + 2 \log_2(1 + E / D) + \log_2(1 + \sinh^2(2h) E / D)
         + \sum_k \log_2(1 + c_k^2 A / 12 D)
 
-    The terms are those of the centre, of scale and ratio, of the angle, and of the colours, rotated as they are coded.
+    The terms are, in order: centre; scale and ratio; angle; colours, in the opponent space of the file.
     :math:`E = A |c|^2` is the energy, :math:`A = \pi \sigma_1 \sigma_2` the area, :math:`2h = \ln(\sigma_1 /
     \sigma_2)`.
 

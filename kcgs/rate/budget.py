@@ -1,4 +1,4 @@
-"""A file of at most `target_bytes` from an image: the number of Gaussians, the regions, the fit, the rounding."""
+"""Fit an image to a file of at most `target_bytes`: choose N and the regions, fit, and round."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ from kcgs.scene import Scene
 
 from .compress import Compressor
 
-# fixed-point iterations of the number of Gaussians, which the bits of one depend on
+# fixed-point iterations for the number of Gaussians, since the bits per Gaussian depend on it
 _COUNT_ITERATIONS = 4
-# of a file of one Gaussian without a map
+# least size of a file: one Gaussian without a map
 _MIN_BYTES = 40
 
 
 @dataclass(frozen=True)
 class GaussianBudget:
-    """The number of Gaussians of the best file of so many bytes, their least width, and the iterations they take.
+    """The number of Gaussians for a size of a file, their least width, and the iterations of fit and rounding.
 
-    More Gaussians leave fewer bits for each: the fit has less error, and rounding adds more. All fields are tuned.
-    To tune one again, change it and compare the files of ``python -m benchmarks rate``, which are of one size.
+    With more Gaussians there are fewer bits for each: the fit has less error, and rounding adds more. All fields are
+    tuned. To tune one again, change it and compare the files of ``python -m benchmarks rate``: all have the same size.
     """
 
     bits_per_gaussian: float = 25.2
@@ -45,23 +45,23 @@ class GaussianBudget:
     reference_count: int = 2100
     """Number of Gaussians for which `bits_per_gaussian` holds: a file of 6,700 bytes."""
     bits_per_doubling: float = 1.9
-    """More bits per Gaussian for each doubling of their number. More: small files get more Gaussians, large ones
-    fewer."""
+    """Increase of the bits per Gaussian for each doubling of the number of Gaussians. More: small files get more
+    Gaussians, large files fewer."""
     min_bits_per_gaussian: float = 26.0
-    """Bits per Gaussian, however few there are: up to 2,800 with the other fields as they are."""
+    """Least bits per Gaussian; with the other defaults they hold for up to 2,800 Gaussians."""
     header_bytes: int = 30
-    """Bytes of a file beside Gaussians and map."""
+    """Bytes of a file besides Gaussians and map."""
     least_spacing: float = math.inf
-    """Spacing of Gaussians, the root of pixels by number, above which they have a least width. More: sharper edges, and
+    """Spacing of Gaussians, sqrt(pixels / N), in pixels, above which they have a least width. More: sharper edges, and
     more stray strokes."""
     width_per_spacing: float = 0.12
-    """Least standard deviation by which a Gaussian is wider for each pixel of spacing above that. More: softer images,
-    and fewer stray strokes."""
+    """Least standard deviation, in pixels, per pixel of spacing above `least_spacing`. More: softer images, and fewer
+    stray strokes."""
 
     fit_iterations: int = 700
     """Iterations of the schedule of a fit. More: slower, and less error."""
     compress_iterations: int = 600
-    """Renders that descent and rounding take. More: slower, and less error."""
+    """Renders that descent and rounding together take. More: slower, and less error."""
 
     def num_gaussians(self, target_bytes: float, pixels: int) -> int:
         """Return the number of Gaussians, from 1 to `pixels`, of a file of at most `target_bytes` without a map."""
@@ -74,34 +74,34 @@ class GaussianBudget:
         return min(max(1, round(count)), pixels)
 
     def min_sigma(self, num_gaussians: int, pixels: int) -> float:
-        """Return the least standard deviation of a Gaussian in pixels: thin ones look like stray strokes."""
+        """Return the least standard deviation of a Gaussian in pixels: thin Gaussians look like stray strokes."""
         return self.width_per_spacing * max(0.0, math.sqrt(pixels / num_gaussians) - self.least_spacing)
 
 
 @dataclass(frozen=True)
 class FitBytesSettings:
-    """What a fit to so many bytes trades off: time, and contours against Gaussians.
+    """Trade-offs of a fit to a size of a file: time against error, and contours against Gaussians.
 
     All fields are tuned. To tune one again, change it and compare the files of ``python -m benchmarks rate``.
     """
 
     fit_share: float = 0.845
-    """Share of a fit's schedule that is run; the descent of `compress` does what the rest would do. More: slower."""
+    """Share of a fit's schedule that is run; the descent of `compress` replaces the rest. More: slower."""
     fit_share_with_regions: float = 0.89
-    """The same with a label map, whose contours move for the last time at 0.88: not below it."""
+    """The same share with a label map; at least 0.88, where contours move for the last time."""
     trial_iterations: int = 80
     """Iterations of a trial fit. More: slower, and its error predicts that of the whole fit better."""
     final_error_share: float = 0.65
-    """Squared error after the whole fit, as a share of that after a trial. More: contours must save more error."""
+    """Squared error after the whole fit, as a share of the error after a trial. More: contours must save more error."""
     rate_exponent: float = 0.93
     """e in "squared error ~ bytes^-e", the slope of the rate-distortion curve. More: contours must save more error."""
     reduced_share: float = 0.7
-    """Share of all iterations that the Gaussians of a reduced photo take, which are few. More: slower."""
+    """Share of all iterations that the few Gaussians of a reduced photo take. More: slower."""
     pixels_per_sigma: float = 1.5
-    """Pixels of a reduced photo in the least standard deviation of its Gaussians. More: slower, and finer details."""
+    """Least standard deviation of the Gaussians on a reduced photo, in its pixels. More: slower, and finer details."""
 
 
-# MS-SSIM suffers more from rounding than from fewer Gaussians, and people from stray strokes
+# rounding lowers MS-SSIM more than fewer Gaussians do; the least width avoids visible stray strokes
 BUDGETS: dict[ObjectiveName, GaussianBudget] = {
     "l2": GaussianBudget(),
     "ms-ssim": GaussianBudget(
@@ -117,9 +117,9 @@ _SETTINGS = FitBytesSettings()
 
 @brief
 class FitBytesResult(NamedTuple):
-    """A file, the scene that it decodes to, and the fit that it was made from, before rounding.
+    """A file, the scene that it decodes to, and the fit before rounding.
 
-    Where the fit was one of a reduced photo, so is the PSNR of its history.
+    If the fit was on a reduced photo, the PSNR of its history is that of the reduced photo.
     """
 
     data: bytes
@@ -128,12 +128,12 @@ class FitBytesResult(NamedTuple):
 
 
 class _RegionChoice(NamedTuple):
-    """The regions that pay for their bytes."""
+    """The regions that save more error than their bytes cost."""
 
     regions: RegionMap | None
-    num_gaussians: int  # for the bytes that the regions leave
+    num_gaussians: int  # number for the bytes that the map leaves
     contour_cost: float  # squared error that a pixel of contour must save
-    changes: dict[str, Any]  # for the report on the regions
+    changes: dict[str, Any]  # arguments of `report_regions`
 
 
 @torch.inference_mode(False)
@@ -151,27 +151,27 @@ def fit_bytes(
 ) -> FitBytesResult:
     """Fit an image to a file of at most `target_bytes`, everything included.
 
-    Convention: all bits save the same error at the margin. The number of Gaussians is that at which another Gaussian
-    and finer rounding of all would save as much. A pixel of contour must save what its bits would save as Gaussians,
-    else it moves or its regions are merged. The map as a whole is used if a short fit with it has less error than one
-    with Gaussians for its bytes, in the image and along the contours. With ``merge_regions=False`` the whole map is
+    Convention: all bits save about the same error. For the chosen number of Gaussians, one more Gaussian saves as much
+    as finer rounding of all. A pixel of contour must save as much error as Gaussians of the same bits would; otherwise
+    it moves, or its regions are merged. The map is used if a short fit with it has less error, in the image and along
+    the contours, than a short fit without it and with more Gaussians. With ``merge_regions=False`` the whole map is
     used. ``result.regions`` reports the changes of the map.
 
-    With the objective ms-ssim, the default, no Gaussian is much thinner than the others are apart: thin ones look like
-    stray strokes. A file with few bytes for its pixels is fitted on a reduced photo, without a map unless
-    ``merge_regions=False``; its scene has the size of the photo.
+    The objective is ms-ssim by default. It gives Gaussians a least width that grows with their spacing: thin Gaussians
+    look like stray strokes. If a file has few bytes per pixel, the fit runs on a reduced photo, without a map unless
+    ``merge_regions=False``; the scene still has the size of the photo.
 
     Args:
         image: as in :func:`kcgs.fit`.
-        regions: as there.
+        regions: as in :func:`kcgs.fit`.
         target_bytes: largest size of the file, at least 40.
-        recipe: as there.
-        seed: as there.
-        on_step: as there, for the fit itself, not the trials.
-        progress: as there.
-        settings: as there; `contour_cost` is replaced by the coder's, and `max_seconds` is for the fit alone. Without
-            it the rate-distortion descent replaces the last iterations, 11 or 15 %. A fit has 500 iterations, 350 on a
-            reduced photo, 700 with the objective l2.
+        recipe: as in :func:`kcgs.fit`.
+        seed: as in :func:`kcgs.fit`.
+        on_step: as in :func:`kcgs.fit`, for the fit itself, not for the trials.
+        progress: as in :func:`kcgs.fit`.
+        settings: as in :func:`kcgs.fit`. The cost of a contour's bits replaces `contour_cost`; `max_seconds` limits
+            the fit alone. Without `max_seconds` the rate-distortion descent replaces the last 11 or 15 % of the
+            iterations. A fit has 500 iterations, 350 on a reduced photo, 700 with the objective l2.
 
     Returns:
         The file, the scene that it decodes to, and the fit.
@@ -214,7 +214,7 @@ def _budget(config: FitConfig) -> GaussianBudget:
 
 
 def _reduce(problem: Problem, choice: _RegionChoice) -> Problem:
-    """Return the problem of the fit: without a map, of a photo that is as small as the least width allows."""
+    """Return the problem of the fit; without a map, the photo is reduced as far as the least width allows."""
     config, (height, width) = problem.config, problem.size
     budget, min_sigma = _budget(config), _min_sigma(problem, choice.num_gaussians)
     reduction = _reduction(min_sigma) if choice.regions is None else 1
@@ -229,13 +229,13 @@ def _reduce(problem: Problem, choice: _RegionChoice) -> Problem:
 
 
 def _min_sigma(problem: Problem, num_gaussians: int) -> float:
-    """Return the least standard deviation of so many Gaussians, in pixels of the photo."""
+    """Return the least standard deviation of `num_gaussians` Gaussians, in pixels of the photo."""
     config, pixels = problem.config, problem.size[0] * problem.size[1]
     return max(config.min_sigma, _budget(config).min_sigma(num_gaussians, pixels))
 
 
 def _reduction(min_sigma: float) -> int:
-    """Return the factor by which a photo may be reduced that has no finer Gaussians."""
+    """Return the factor by which a photo may be reduced if no Gaussian is thinner than `min_sigma`."""
     return max(1, int(min_sigma / _SETTINGS.pixels_per_sigma))
 
 
@@ -244,7 +244,7 @@ def _shorten(iterations: int, reduction: int) -> int:
 
 
 def _enlarge(scene: Scene, size: tuple[int, int]) -> Scene:
-    """Return the scene of a reduced photo at the size of the photo."""
+    """Scale the scene of a reduced photo to the size of the photo."""
     if scene.size == size:
         return scene
     field = scene.field
@@ -253,7 +253,7 @@ def _enlarge(scene: Scene, size: tuple[int, int]) -> Scene:
 
 
 def _choose_regions(problem: Problem, target_bytes: int) -> _RegionChoice:
-    """Merge regions whose contours do not pay for their bytes, then drop the map if it does not pay as a whole."""
+    """Merge regions whose contours save too little for their bytes; drop the map if it saves too little as a whole."""
     image, regions, config = problem.canvas[0], problem.regions, problem.config
     num_gaussians = partial(_budget(config).num_gaussians, pixels=image.shape[1] * image.shape[2])
     choice = _RegionChoice(None, num_gaussians(target_bytes), config.contour_cost, {})
@@ -266,7 +266,7 @@ def _choose_regions(problem: Problem, target_bytes: int) -> _RegionChoice:
         return choice._replace(regions=regions, num_gaussians=num_gaussians(target_bytes - map_bytes))
     if _reduction(_min_sigma(problem, choice.num_gaussians)) > 1:
         return choice._replace(changes={"dropped": "bytes"})
-    # by iterations, so that without a clock the same arguments give the same file
+    # trials are limited by iterations, not by time, so that the same arguments give the same file
     iterations = min(_SETTINGS.trial_iterations, config.planned_iterations)
     trial_config = FitConfig.from_recipe(
         config, merge_regions=False, iterations=iterations, max_seconds=None, objective="l2"
@@ -298,7 +298,7 @@ def _choose_regions(problem: Problem, target_bytes: int) -> _RegionChoice:
 
 
 def _map_bytes(regions: RegionMap) -> int:
-    """Return the bytes that the label map takes in a file."""
+    """Return the size of the label map in a file, in bytes."""
     return 0 if regions.num_regions == 1 else len(encode_region_map(regions))
 
 
@@ -308,7 +308,7 @@ def _fit_share(
     on_step: Callable[[int, HistoryEntry], bool | None] | None = None,
     progress: bool = False,
 ) -> FitResult:
-    """Run the first share of a fit's schedule; all of it where a clock ends the fit."""
+    """Run the first share of a fit's schedule; the whole schedule in a fit with a clock."""
     config = problem.config
     until = 1.0 if config.max_seconds else math.ceil(share * config.planned_iterations) / config.planned_iterations
     return fit_problem(problem, on_step, progress, until=until)

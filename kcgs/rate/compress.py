@@ -1,4 +1,4 @@
-"""A file from a scene and its image: rate-distortion descent of the Gaussians, then gradual rounding."""
+"""Compress a scene, given its image: rate-distortion descent of the Gaussians, then gradual rounding."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from kcgs.scene import Scene
 from .descent import RATE, RateDistortionDescent
 from .rounding import round_gradually
 
-# dB of `quality` above the scene's PSNR at which rounding adds about a 28th to the squared error, 0.15 dB; it adds more
-# where Gaussians are so few that rounding errors do not average out
+# dB between the scene's PSNR and `quality`: rounding then adds about a 28th to the squared error, 0.15 dB, or more if
+# there are too few Gaussians for rounding errors to average out
 _QUALITY_MARGIN = 14.5
-# dB added to the quality, one after the other, until a file reaches `target_psnr`
+# dB that are added to the quality until a file reaches `target_psnr`
 _QUALITY_STEPS = (0.0, 2.0, 5.0, 9.0, 14.0, 20.0, 30.0, 50.0)
 
 
@@ -53,19 +53,18 @@ def compress(
 ) -> Compressed:
     """Write a scene as a `.kcgs` file with the least error against its image.
 
-    Convention: first a descent lowers the error and, at the rate at which bits buy error, the bits of all Gaussians.
-    Then Gaussians are rounded a few at a time, and those that are not rounded yet correct the error. Gaussians too
-    faint to pay for their bits are removed. The error is about a third less than that of :func:`kcgs.codec.encode` at
-    the same bytes.
+    Convention: first a descent lowers the error plus the price of all bits. Then a few Gaussians at a time are rounded,
+    while the Gaussians that are not rounded yet correct the error. Gaussians that save less error than their bits cost
+    are removed. The error is about a third less than that of :func:`kcgs.codec.encode` at the same size.
 
     Args:
         scene: N Gaussians of one image; opacities are merged into the colours, and metadata are not stored.
-        image: what :func:`kcgs.fit` takes, of the scene's size and channels.
-        quality: as in :func:`kcgs.codec.encode`; the error is lower, for Gaussians correct each other. None, with no
-            target: that of :func:`quality_for`, so that the file is nearly as good as the scene.
-        target_bytes: write the finest file of at most `target_bytes`, in place of `quality`.
-        target_psnr: dB against the image, in place of both: the coarsest of a few qualities that reaches it, or where
-            the scene itself does not, a file that is nearly as good as the scene.
+        image: as in :func:`kcgs.fit`, with the scene's size and channels.
+        quality: as in :func:`kcgs.codec.encode`; the error is lower, since Gaussians correct each other. None, without
+            a target: the value of :func:`quality_for`, so that the file is nearly as good as the scene.
+        target_bytes: write the best file of at most this size, in place of `quality`.
+        target_psnr: PSNR in dB against the image, in place of both: write the coarsest of a few qualities that reaches
+            it. If the scene itself does not reach it, the file is nearly as good as the scene.
         iterations: renders that descent and rounding may take, at least 1.
         seed: of the order in which Gaussians are rounded.
         objective: of the descent, l2 or ms-ssim, as in :class:`kcgs.FitConfig`. None: ms-ssim with `target_bytes`,
@@ -89,7 +88,7 @@ def compress(
     target = as_image("image", image)
     if tuple(target.shape) != (writer.channels, *writer.size):
         raise InvalidArgument("image", f"shape {(writer.channels, *writer.size)}", tuple(target.shape), verb="have")
-    # a copy: an inference tensor cannot take part in a graph
+    # copy: autograd does not accept inference tensors
     target = target.detach().to("cpu", torch.float32, copy=True)
     if target_psnr is not None:
         check_number("target_psnr", target_psnr, 0.0, unit="dB")
@@ -128,35 +127,35 @@ def quality_for(psnr: float) -> float:
 
 @dataclass(frozen=True)
 class CompressionSchedule:
-    """How the iterations of a file are spent, and which sizes they aim at on the way to `target_bytes`.
+    """The division of the iterations into phases, and the sizes that each phase aims at for `target_bytes`.
 
-    All fields are tuned. To tune one again, change it and compare the files of ``python -m benchmarks rate``, which are
-    of one size.
+    All fields are tuned. To tune one again, change it and compare the files of ``python -m benchmarks rate``: all have
+    the same size.
     """
 
     descent_share: float = 0.7
-    """Share of the iterations that descend before anything is rounded; the others descend while Gaussians are rounded.
-    More: Gaussians are cheaper, and their neighbours correct less of what rounding adds."""
+    """Share of the iterations before rounding starts; in the others the descent goes on while Gaussians are rounded.
+    More: Gaussians are cheaper, and their neighbours correct less of the rounding errors."""
     update_interval: int = 70
     """Iterations between two updates of the QP, each of which writes a file. More: faster, and farther from the
     target."""
     prune_from: float = 0.8
-    """Share of the descent from which on Gaussians are pruned that do not pay for their bits. More: they have longer to
-    become useful, and the others less time to replace them."""
+    """Share of the descent after which Gaussians are pruned that save less error than their bits cost. More: they have
+    more time to become useful, and the others have less time to replace them."""
     descent_aim: float = 1.006
-    """Size that the descent aims at, as a share of `target_bytes`, since rounding gradually saves 0.6 %."""
+    """Size that the descent aims at, as a share of `target_bytes`: gradual rounding saves 0.6 %."""
     rounding_aim: float = 1.01
-    """Size that rounding aims at, as a share of `target_bytes`; Gaussians in excess are removed on the way. More: more
-    are removed. Less: more files are too small and rounded again."""
+    """Size that rounding aims at, as a share of `target_bytes`; excess Gaussians are removed on the way. More: more
+    Gaussians are removed. Less: more files are too small and are rounded again."""
     min_fill: float = 0.995
-    """Share of `target_bytes` that is enough. More: slower, and less error."""
+    """Share of `target_bytes` that is large enough. More: slower, and less error."""
     max_roundings: int = 3
-    """Most roundings of a scene until a file has `min_fill`."""
+    """Largest number of roundings of a scene until a file has `min_fill`."""
     max_secants: int = 4
-    """Most files that are written to find the QP of the first rounding."""
+    """Largest number of files that are written to find the QP of the first rounding."""
     bytes_gain: float = 1.3
-    """Factor of the change of bytes that an update of the QP aims at: numbers that round to 0 take no more bits when
-    their steps become finer. More: the size swings. Less: it lags behind."""
+    """Factor on the change of size that an update of the QP aims at: numbers that round to 0 take no more bits when
+    their steps become finer. More: the size oscillates. Less: it lags behind."""
 
 
 _SCHEDULE = CompressionSchedule()
@@ -174,16 +173,16 @@ class Compressor:
 
     @property
     def descent_iterations(self) -> int:
-        """Iterations before anything is rounded."""
+        """Number of iterations before rounding."""
         return int(_SCHEDULE.descent_share * self.iterations)
 
     @property
     def rounding_iterations(self) -> int:
-        """Iterations while Gaussians are rounded."""
+        """Number of iterations in which Gaussians are rounded."""
         return self.iterations - self.descent_iterations
 
     def search_bytes(self, target_bytes: int) -> bytes:
-        """Return a file of at most `target_bytes`, and nearly as many."""
+        """Return a file of nearly, but at most, `target_bytes`."""
 
         def update_qp(writer: SceneWriter, qp: int) -> int:
             size = len(writer.write_rounded(qp))
@@ -206,7 +205,7 @@ class Compressor:
         return writer.largest_file(lambda qp: self._round(writer, qp, 0), target_bytes)[1]
 
     def _secant(self, writer: SceneWriter, qp: int, target_bytes: int) -> int:
-        """Return the QP at which a file that is rounded at once has about `target_bytes`, by the secant method."""
+        """Find, by the secant method, the QP at which a file has about `target_bytes` if it is rounded at once."""
         sizes: dict[int, int] = {}
         while len(sizes) < _SCHEDULE.max_secants and qp not in sizes:
             sizes[qp] = len(self._round(writer, qp, 0))
@@ -218,7 +217,7 @@ class Compressor:
         return qp
 
     def search_psnr(self, target_psnr: float, scene_psnr: float) -> bytes:
-        """Return the coarsest file that reaches `target_psnr`, or where the scene does not, the coarsest of all."""
+        """Return the coarsest file that reaches `target_psnr`; if the scene does not reach it, the coarsest of all."""
         for step in _QUALITY_STEPS if scene_psnr >= target_psnr else _QUALITY_STEPS[:1]:
             data = self.write(self.writer.qp_for(quality_for(scene_psnr + step)))
             if float(psnr(decode(data).scene.render(), self.objective.image)) >= target_psnr:
@@ -230,7 +229,7 @@ class Compressor:
         return self._round(self._descend(qp, lambda _, qp: qp)[0], qp, self.rounding_iterations)
 
     def _descend(self, qp: int, update_qp: Callable[[SceneWriter, int], int]) -> tuple[SceneWriter, int]:
-        """Lower error and bits with nothing rounded; `update_qp` returns the QP for the scene of the moment.
+        """Lower error and bits before rounding; `update_qp` returns the QP for the current scene.
 
         Returns:
             The Gaussians, and the last QP.

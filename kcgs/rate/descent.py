@@ -1,4 +1,4 @@
-"""Rate-distortion descent: Gaussians lower their error and, at a price, their bits."""
+"""Rate-distortion descent: Gaussians lower their error plus the price of their bits."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from kcgs.optim import Gaussians, ImageObjective, NewtonDescent, Renderer, self_
 from .bits import soft_bits
 
 # Prices are in units of D, the distortion that one rounded number adds. In theory a bit saves 2 ln 2 D = 1.4 D. Here
-# neighbours correct rounding errors, so both numbers are tuned: vary one and compare `python -m benchmarks rate`.
+# neighbours correct rounding errors, so both prices are tuned: change one and compare `python -m benchmarks rate`.
 
-# error that a bit must save: a higher price makes Gaussians cheaper, and the image worse before they are rounded
+# error that a bit must save; higher: Gaussians take fewer bits, and the image is worse before rounding
 _BIT_PRICE = 0.9
-# energy of a Gaussian that pays for its bits, about 30: a higher one leaves fewer Gaussians, each rounded less
+# energy that a Gaussian of about 30 bits must have; higher: fewer Gaussians, each rounded less
 _GAUSSIAN_PRICE = 20.0
-# share of a Newton step in a step: larger ones oscillate, smaller ones take more iterations
+# step size, as a share of the Newton step; larger steps oscillate, smaller steps take more iterations
 RATE = 0.09
-# steps for which the gradient of the bits, and what errors weigh, are reused, which change slowly
+# steps that reuse the gradient of the bits and the weights of errors: both change slowly
 _REUSE_STEPS = 4
 
 
 class RateDistortionDescent(NewtonDescent):
-    """Gaussians on their way to less error and fewer bits.
+    """A descent of Gaussians to less error and fewer bits.
 
-    To the Newton steps of the error this adds the price of bits, at `quantizer`, and numbers that are rounded.
+    It extends the Newton steps of the error by the price of bits at `quantizer`, and by rounded numbers.
 
     Args:
-        writer: of the start, with its map, which stays.
-        objective: of the photo, on the CPU, or without a map of a reduced one.
+        writer: has the first Gaussians and the map, which does not change.
+        objective: of the photo, on the CPU; without a map also of a reduced photo.
         min_sigma: least standard deviation of a Gaussian, in pixels of the photo.
     """
 
     quantizer: Quantizer
-    """Of the file, at the moment."""
+    """The current quantizer of the file."""
 
     def __init__(self, writer: SceneWriter, objective: ImageObjective, min_sigma: float = 0.0) -> None:
         image, (height, width) = objective.image, writer.size
@@ -49,7 +49,7 @@ class RateDistortionDescent(NewtonDescent):
         self._num_pixels, self.ids = height * width, writer.ids
         gaussians = self._as_tensors(writer.gaussians, image)
         renderer = Renderer(size, writer.regions)
-        # steps are so short that the first order of the shear is enough
+        # steps are short: the first order of the shear is enough
         super().__init__(gaussians, objective, renderer, exact=False, min_sigma=min_sigma)
         self._image = image
         self._error_weights = self._weigh(self.gaussians)
@@ -62,7 +62,7 @@ class RateDistortionDescent(NewtonDescent):
         return Parameters(*(numbers.double().numpy() for numbers in self.gaussians[:3]))
 
     def round(self, values: Parameters, shape_mask: Tensor, color_mask: Tensor) -> None:
-        """Give the numbers of a mask their rounded values in the steps from here on, in which they do not move.
+        """Fix the numbers of a mask at their rounded values in all further steps.
 
         Args:
             values: of all Gaussians.
@@ -75,7 +75,7 @@ class RateDistortionDescent(NewtonDescent):
         self.frozen = torch.cat(frozen, -1)
 
     def step(self, rate: float) -> None:
-        """Move all numbers but those that are rounded."""
+        """Move all numbers that are not rounded."""
         free = self.gaussians
         if self._rounded is None:
             super().step(rate)
@@ -83,18 +83,18 @@ class RateDistortionDescent(NewtonDescent):
         masks, values = self._rounded
         self.gaussians = masks.map(torch.where, values, free)
         super().step(rate)
-        # the others keep their values before rounding: later they may be rounded to others
+        # rounded numbers keep their values from before rounding: later they may be rounded to other values
         self.gaussians = masks.map(torch.where, free, self.gaussians)
 
     def prune(self) -> None:
-        """Remove the Gaussians that do not pay for their bits; one stays at least."""
+        """Remove the Gaussians that save less error than their bits cost; at least one stays."""
         energy = self._energy()
         rows = energy >= _GAUSSIAN_PRICE * self._error_scale * self.quantizer.distortion
         rows[energy.argmax()] = True
         self._select(rows.numpy())
 
     def remove_weakest(self, count: int) -> NDArray[np.bool_]:
-        """Remove so many of the weakest Gaussians, but one stays at least; return the mask of those that stay."""
+        """Remove the `count` weakest Gaussians, but at least one stays; return a mask of the remaining ones."""
         rank = self._energy().argsort(stable=True).argsort().numpy()
         rows = rank >= min(count, len(rank) - 1)
         self._select(rows)
@@ -107,30 +107,30 @@ class RateDistortionDescent(NewtonDescent):
         self._bit_gradient = None
 
     def half_gradients(self) -> Gaussians:
-        """Return half the gradients of the error, summed over the pixels of the photo, and of the price of the bits."""
+        """Return half the gradients of error plus price of bits; the error is a sum over the pixels of the photo."""
         if self._bit_gradient is None or self.iteration % _REUSE_STEPS == 0:
             self._bit_gradient = self._half_bit_gradient()
             self._error_weights = self._weigh(self.gaussians)
         ids = None if self.renderer.regions is None else self.renderer.regions.ids[torch.from_numpy(self.ids)]
         gradients = self.objective.gradients(self.renderer, self._scaled(self.gaussians)._replace(region_ids=ids))
-        # a pixel of the image stands for so many of the photo
+        # pixels of the photo per pixel of the reduced image
         pixels = self._num_pixels / (self.renderer.size[0] * self.renderer.size[1])
         scaled = self._scaled(gradients.map(lambda gradient: pixels * gradient))
         return scaled.map(torch.add, self._bit_gradient)
 
     def color_curvature(self) -> Tensor:
-        """Return half the second derivative of the error by a colour, (N,)."""
+        """Return half the second derivative of the error with respect to a colour, (N,)."""
         return self_product(self.gaussians.cholesky).clamp_max(self._num_pixels) * self._error_weights
 
     def _half_bit_gradient(self) -> Gaussians:
-        """Return half the gradient of the price of the bits, which is 0 by means."""
+        """Return half the gradient of the price of the bits; it is 0 for means."""
         cholesky, colors = (t.detach().requires_grad_() for t in self.gaussians[1:3])
         price = 0.5 * _BIT_PRICE * self._error_scale * self.quantizer.distortion
         bits = price * soft_bits(cholesky, colors, self.quantizer).sum()
         return Gaussians(torch.zeros_like(self.gaussians.means), *torch.autograd.grad(bits, (cholesky, colors)))
 
     def _scaled(self, gaussians: Gaussians) -> Gaussians:
-        """Return Gaussians, or gradients by those, as they are on the image."""
+        """Scale Gaussians to the image's size, or gradients on the image to those of the Gaussians."""
         return gaussians.map(torch.mul, self._scale)
 
     def _weigh(self, gaussians: Gaussians) -> Tensor:

@@ -12,16 +12,16 @@ from kcgs.optim import End, Event, TimedAction, count_iterations, run
 
 from .descent import RATE, RateDistortionDescent
 
-# Numbers are tuned: vary one and compare the files of `python -m benchmarks rate`.
+# These numbers are tuned: change one and compare the files of `python -m benchmarks rate`.
 
 # share of the iterations in which places and shapes are rounded; colours are rounded in the rest
 _SHAPE_SHARE = 0.65
-# iterations from one group of Gaussians that is rounded to the next
+# iterations between two groups of Gaussians that are rounded
 _GROUP_INTERVAL = 3
-# bytes of one of the weakest Gaussians, as a share of the mean
+# bytes of each of the weakest Gaussians, as a share of the mean over all Gaussians
 _WEAK_SHARE = 0.75
-# shares of the iterations; before the next group Gaussians are removed if the file is too large: early enough that the
-# others correct the error
+# shares of the iterations at which Gaussians are removed if the file is too large: the others have time to correct
+# the error
 _SIZE_CHECKS = (0.3, 0.65, 0.9)
 
 
@@ -32,13 +32,13 @@ def round_gradually(
     seed: int,
     max_bytes: float = math.inf,
 ) -> bytes:
-    """Round all Gaussians of a descent, in an order of the seed, and return their file.
+    """Round all Gaussians of a descent, in a random order, and return their file.
 
-    Gaussians overlap, so the neighbours of one that is rounded can partly correct its error, as long as they are free
-    to move. Places and shapes are rounded first, colours last.
+    Gaussians overlap, so the neighbours of a rounded Gaussian can partly correct its error, as long as they are free to
+    move. Places and shapes are rounded first, colours last.
 
     Args:
-        descent: of the Gaussians, which are removed from it where the file is too large.
+        descent: has the Gaussians; some are removed from it if the file is too large.
         write: returns the file of the Gaussians of `descent`.
         iterations: steps of the descent; 0: round all at once.
         seed: of the order.
@@ -65,7 +65,7 @@ class _Rounding:
         self.classes = descent.quantizer.classify(descent.parameters())
 
     def codes(self) -> Codes:
-        """Round all Gaussians as they are."""
+        """Round all current Gaussians."""
         return self.descent.quantizer.quantize(self.descent.parameters(), self.classes)
 
     def check_size(self) -> None:
@@ -81,11 +81,11 @@ class _Rounding:
         descent.round(descent.quantizer.dequantize(self.codes()), shape_mask, color_mask)
 
     def remove_excess(self, size: int) -> None:
-        """Remove the weakest Gaussians of a file of so many bytes, if those are too many."""
+        """Remove the weakest Gaussians if the `size` of their file, in bytes, is too large."""
         rows = self.descent.remove_weakest(_excess(size, self.max_bytes, len(self.descent.ids)))
         self.order, self.classes = self.order[:, rows], Classes(*(numbers[rows] for numbers in self.classes))
 
 
 def _excess(size: int, max_bytes: float, num_gaussians: int) -> int:
-    """Return how many of the weakest Gaussians the bytes above `max_bytes` are for."""
+    """Return the number of the weakest Gaussians that take the bytes above `max_bytes`."""
     return max(0, math.ceil((size - max_bytes) * num_gaussians / (_WEAK_SHARE * size)))

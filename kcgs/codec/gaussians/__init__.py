@@ -1,1 +1,1 @@
-"""Gaussians as whole numbers, in layers."""
+"""The coder of Gaussians: they become whole numbers, and are written in layers."""

@@ -1,6 +1,7 @@
-"""The numbers of Gaussians, coded in layers, the strongest first, so that a part of a file is an image.
+"""Gaussians coded in layers, the strongest first, so that the beginning of a file is an image.
 
-A layer has a group for each of its classes of energy: by class of size, how many Gaussians, then each (docs/format.md).
+A layer has a group for each of its classes of energy: the numbers of Gaussians by class of size, then the Gaussians
+(docs/format.md).
 """
 
 from __future__ import annotations
@@ -22,28 +23,29 @@ from .occupancy import COUNT_BITS, OccupancyCoder
 from .quantize import ENERGIES, MAX_RATIO, OCTAVES, SIZES, Classes, Codes, Parameters, Quantizer
 from .shapes import ANGLE, SHAPES
 
-_NUM_CLASSES = 64  # of size, that a stream can name
-# weights at first
-_STRAY_WEIGHTS = np.array([20.0, 0.5])  # a Gaussian of the region under its centre, and of another
+_NUM_CLASSES = 64  # classes of size that a stream can name
+# first weights of the models
+_STRAY_WEIGHTS = np.array([20.0, 0.5])  # a Gaussian is of the region under its centre, or of another
 _COUNT_WEIGHTS = np.array([2.0, *[1.0] * 9, *[0.3] * (COUNT_BITS - 9)])  # by count of bits
-_RATIO_SCALE = 2.0  # half the log2 of the ratio of scales, by which ratios are measured
-_FIRST_RATIO_SIZE = -1  # class of size of the first context of ratios; smaller ones share it
-_LEVELS = 8  # scales within a class of size, by which colours are measured
-# amplitude of a channel, in the Gaussian's own, above which the next channel's context is 1, and 2
+_RATIO_SCALE = 2.0  # scale of the magnitudes of ratios, in half the log2 of the ratio
+_FIRST_RATIO_SIZE = -1  # class of size of the first context of ratios; smaller classes share it
+_LEVELS = 8  # scales of the magnitudes of colours, within a class of size
+# magnitude of a channel, in the Gaussian's amplitude, above which the next channel's context is 1, or 2
 _MEDIUM = 0.35
 _STRONG = 0.8
 # symbols after a group
-_END = 0  # of the layer
-_PRESENT = 1  # a group of the next energy down
-_ABSENT = 2  # no group of that energy
+_END = 0  # the layer ends
+_PRESENT = 1  # a group of the next lower class of energy follows
+_ABSENT = 2  # there is no group of this class
 Group = tuple[Codes, Integers]
-"""Gaussians of one energy, and the positions of their regions' ids."""
+"""Gaussians of one class of energy, and the indices of their regions."""
 
 
 class LayerCoder:
-    """Writes or reads layers one after another, by models that learn from all layers so far. The map is on the CPU.
+    """Write or read layers one after another, with models that learn from all layers so far.
 
-    One procedure does both, so that they agree: `_code` and what it calls take values, which a reader ignores.
+    The map is on the CPU. One procedure, `_code`, both writes and reads, so that both agree; it takes values, which a
+    reader ignores.
     """
 
     def __init__(self, quantizer: Quantizer, channels: int, regions: RegionMap | None) -> None:
@@ -56,11 +58,11 @@ class LayerCoder:
         self._occupancy = OccupancyCoder(quantizer.size)
 
     def write(self, writer: Writer, groups: list[Group]) -> None:
-        """Write a layer of groups in the order of a file, energies falling."""
+        """Write a layer of groups in the order of a file: the highest class of energy first."""
         self._code(writer, int(groups[0][0].energy[0]), groups, sum(len(ids) for _, ids in groups))
 
     def read(self, reader: Reader, energy: int, max_count: int) -> list[tuple[Parameters, Integers]]:
-        """Read the groups of a layer; `energy` is the class of the first, and more Gaussians an error."""
+        """Read the groups of a layer from class `energy` on; more than `max_count` Gaussians are an error."""
         return self._code(reader, energy, [], max_count)
 
     def _code(
@@ -80,7 +82,7 @@ class LayerCoder:
         return coded
 
     def _placeholders(self, count: int) -> Group:
-        """Return what a reader has in place of a group."""
+        """Return the values that a reader passes in place of a group."""
         one, two, colors = (np.broadcast_to(np.int64(0), (count, *row)) for row in ((), (2,), (self.channels,)))
         return Codes(one, one, one, one, one, colors, two, two), one
 
@@ -116,13 +118,13 @@ class LayerCoder:
         return coded
 
     def _code_parameters(self, coder: Coder, classes: Classes, cell: Integers, codes: Codes) -> Parameters:
-        """Code all numbers but the cells."""
+        """Code all numbers of Gaussians except their cells."""
         steps = self.quantizer.steps(classes)
         scale = coder.uniform(steps.num_scales, codes.scale)
         ratio = self._code_ratios(coder, classes, float(steps.ratio[0]), codes.ratio)
         num_angles = steps.num_angles(ratio)
         angle = self._angle.code(coder, num_angles, codes.angle)
-        # the amplitude at this energy, in steps of colour, where the scale is in the middle of its class
+        # amplitude of this class of energy, in steps of colour, for a scale in the middle of its class
         amplitude = math.ldexp(math.sqrt(math.pi / (12.0 * self.quantizer.distortion)), int(classes.energy[0]))
         amplitudes = amplitude * exp2(OCTAVES * (0.5 - (np.arange(_LEVELS) + 0.5) / _LEVELS))
         level = (_LEVELS * scale + _LEVELS // 2) // steps.num_scales
@@ -133,7 +135,7 @@ class LayerCoder:
         return steps.dequantize(Codes(*classes, scale, ratio, angle, colors, cell, np.stack(places, -1)), shape)
 
     def _code_ratios(self, coder: Coder, classes: Classes, step: float, ratios: Integers) -> Integers:
-        """Code the ratios of scales; `step` is that of the group."""
+        """Code the ratios of scales; `step` is the group's step of a ratio."""
         context = np.clip(classes.size - _FIRST_RATIO_SIZE, 0, len(SHAPES.ratio) - 1)
         level = np.zeros_like(context)
         ratio = self._ratio.code(coder, np.array([_RATIO_SCALE / step]), level, context, ratios)
@@ -157,14 +159,14 @@ class LayerCoder:
         return np.stack(channels, -1)
 
     def _code_regions(self, coder: Coder, means: NDArray[Any], ids: Integers) -> Integers:
-        """Code the region of each Gaussian, as the position of its id: that under its centre, or another."""
+        """Code the index of each Gaussian's region: the region under its centre, or another."""
         if self.regions is None:
             return np.zeros(len(means), np.int64)
         row, column = pixels_under(torch.from_numpy(means), self.regions.size)
         coded = self.regions.index[0, row, column].numpy().astype(np.int64)
         strays = self._strays.code(coder, (ids != coded).astype(np.int64))
         index = np.flatnonzero(strays)
-        # a distance from the region under the centre, modulo the number of regions
+        # distance from the index of the region under the centre, modulo the number of regions
         distance = (ids[index] - coded[index] - 1) % self.num_regions
         distance = coder.uniform(np.full(len(index), self.num_regions - 1), distance)
         coded[index] = (coded[index] + 1 + distance) % self.num_regions
@@ -172,7 +174,7 @@ class LayerCoder:
 
 
 def _next_symbol(remaining: list[Group], energy: int) -> int:
-    """Return what an encoder writes after a group, before this energy; a decoder ignores it."""
+    """Return the symbol that an encoder writes before this class of energy; a decoder ignores it."""
     if not remaining:
         return _END
     return _PRESENT if remaining[0][0].energy[0] == energy else _ABSENT

@@ -1,4 +1,4 @@
-"""How many Gaussians of a class lie in each cell of a grid over the image; their order is free (docs/format.md)."""
+"""The number of Gaussians of a class in each cell of a grid over the image; their order is free (docs/format.md)."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from kcgs.codec.adaptive import AdaptiveNumber
 from kcgs.codec.exact import Floats, Integers
 from kcgs.codec.rangecoder import ONE, CodecError, Coder
 
-COUNT_BITS = 21  # of a number of Gaussians
-_CELLS_PER_GAUSSIAN = 16  # at least, of cells larger than a pixel
+COUNT_BITS = 21  # bits of the largest number of Gaussians
+_CELLS_PER_GAUSSIAN = 16  # least number of cells per Gaussian, if cells are larger than a pixel
 
-# limits on cells outside the image: Gaussians beyond are moved to the border
+# limits on cells outside the image: Gaussians beyond them are moved to the border
 _MAX_MARGIN = 255  # cells beyond each side
-_MAX_OUTSIDE = 1 << 17  # cells of a grid, beside 15 times those inside
-# limits on the work of a decoder: hours
-_MAX_TOTAL_OUTSIDE = 1 << 26  # cells of all grids of a file, beside those for its Gaussians
-_MAX_OUTSIDE_EACH = 1 << 10  # cells for each Gaussian
-_MAX_CLASSES = 1 << 12  # classes of size in all groups; an encoder has 65 * 37 at most
+_MAX_OUTSIDE = 1 << 17  # cells outside of a grid, in addition to 15 times the cells inside
+# limits that keep the work of a decoder below hours
+_MAX_TOTAL_OUTSIDE = 1 << 26  # cells outside of all grids of a file, in addition to those for its Gaussians
+_MAX_OUTSIDE_EACH = 1 << 10  # cells outside for each Gaussian of the file
+_MAX_CLASSES = 1 << 12  # classes of size in all groups; an encoder has at most 65 * 37
 
-# weights at first, by count of bits
+# first weights, by count of bits
 _MARGIN_WEIGHTS = np.array([3.0, *[1.0] * 4, *[0.3] * 4])
 _OUTSIDE_WEIGHTS = np.array([0.3, *[1.0] * 4, *[0.3] * (COUNT_BITS - 4)])
 
-# the weight of a cell, by the density of earlier Gaussians
-_DENSITY_SIZES = 2  # classes of size above a Gaussian's own that count, too
-_REACH = 4  # columns and rows to either side, to which a Gaussian adds density
-_KERNEL_SUM = 625  # density that a Gaussian adds in all cells: (1 + 2 + 3 + 4 + 5 + 4 + 3 + 2 + 1)^2
-_WEIGHT_PARTS = 64  # of a weight
-_PRIOR_GAUSSIANS = 12  # that all cells share in equal parts
+# the weight of a cell depends on the density of earlier Gaussians
+_DENSITY_SIZES = 2  # larger classes of size that count in addition to the Gaussian's own
+_REACH = 4  # columns and rows on each side to which a Gaussian adds density
+_KERNEL_SUM = 625  # total density that a Gaussian adds: (1 + 2 + 3 + 4 + 5 + 4 + 3 + 2 + 1)^2
+_WEIGHT_PARTS = 64  # weight of a unit of density
+_PRIOR_GAUSSIANS = 12  # Gaussians whose density all cells share equally
 
-_MIN_CHANCE = 16  # of one more Gaussian in a cell, in 1 / ONE
-_MIN_BANDS = 8  # after each the number of remaining Gaussians is known
+_MIN_CHANCE = 16  # least chance of one more Gaussian in a cell, in 1 / ONE
+_MIN_BANDS = 8  # least number of bands; after each band the number of remaining Gaussians is known
 _GROUP = 1 << 16  # cells whose weights are in memory at a time
 
 
@@ -50,18 +50,18 @@ class Grid(NamedTuple):
 
     @classmethod
     def for_count(cls, size: tuple[int, int], count: int) -> Grid:
-        """Return the cells for `count` Gaussians: 16 to 64 cells per Gaussian, of at least a pixel."""
+        """Return the grid for `count` Gaussians: 16 to 64 cells per Gaussian, each at least a pixel."""
         cells = size[0] * size[1] // (_CELLS_PER_GAUSSIAN * max(count, 1))
         return cls.of_side(size, 1 << max(0, (cells.bit_length() - 1) // 2))
 
     @classmethod
     def of_side(cls, size: tuple[int, int], side: int) -> Grid:
-        """Return the cells of `side` pixels that an image of `size` has."""
+        """Return the grid of cells of `side` pixels over an image of `size`."""
         return cls(side, -(-size[0] // side), -(-size[1] // side))
 
     @property
     def max_margin(self) -> int:
-        """The largest margin m of which (rows + 2 m) (columns + 2 m) is within the limit."""
+        """The largest margin m for which (rows + 2 m) (columns + 2 m) is within the limit."""
         excess, perimeter = _MAX_OUTSIDE + 15 * self.rows * self.columns, self.rows + self.columns
         return min((math.isqrt(perimeter * perimeter + 4 * excess) - perimeter) // 4, _MAX_MARGIN)
 
@@ -75,14 +75,14 @@ class Grid(NamedTuple):
         column, row = cell.T
         is_inside_row = (row >= 0) & (row < self.rows)
         is_inside = is_inside_row & (column >= 0) & (column < self.columns)
-        # the cells inside before each, and all cells before it
+        # for each cell the number of cells inside before it, and the number of all cells before it
         inside = np.clip(row, 0, self.rows) * self.columns
         inside += np.where(is_inside_row, np.clip(column, 0, self.columns), 0)
         index = (row + self.margin) * (self.columns + 2 * self.margin) + column + self.margin
         return inside[is_inside], (index - inside)[~is_inside]
 
     def join(self, inside: Integers, outside: Integers) -> Integers:
-        """Return the cells (N, 2) of such indices, in order."""
+        """Return the cells (N, 2) of indices from `split`, in order."""
         width, ring = self.columns + 2 * self.margin, max(2 * self.margin, 1)
         top = self.margin * width
         row, column = np.divmod(outside - top, ring)
@@ -91,19 +91,19 @@ class Grid(NamedTuple):
         index = np.where(outside < top, outside, np.where(row < self.rows, beside, below))
         row, column = np.divmod(inside, self.columns)
         index = np.concatenate([(row + self.margin) * width + column + self.margin, index])
-        # a stable sort merges two sorted halves
+        # both halves are sorted: a stable sort merges them
         row, column = np.divmod(np.sort(index, kind="stable"), width)
         return np.stack([column - self.margin, row - self.margin], -1)
 
 
 class OccupancyCoder:
-    """Codes the cells of one class of size after another; earlier classes weigh the cells of later ones."""
+    """Code the cells of one class of size after another; earlier classes give the weights of later classes' cells."""
 
     def __init__(self, size: tuple[int, int]) -> None:
         self._size = size
         self._margin = AdaptiveNumber(_MARGIN_WEIGHTS)
         self._num_outside = AdaptiveNumber(_OUTSIDE_WEIGHTS)
-        # size and middles of the cells, in half pixels, of each class so far
+        # of each class so far: its size, and the centres of its cells in half pixels
         self._classes: list[tuple[int, Integers]] = []
         self._total_outside = 0  # cells of margins so far
         self._total = 0  # Gaussians so far
@@ -135,7 +135,7 @@ class OccupancyCoder:
         return margin
 
     def _code_inside(self, coder: Coder, grid: Grid, size: int, count: int, index: Integers) -> Integers:
-        """Code the cells inside: a cell is the likelier, the denser earlier Gaussians of about this size are."""
+        """Code the cells inside; a cell is likelier where earlier Gaussians of about this size are denser."""
         shape, num_cells = (grid.rows, grid.columns), grid.rows * grid.columns
         cells = [middle // (2 * grid.side) for other, middle in self._classes if size <= other <= size + _DENSITY_SIZES]
         column, row = np.concatenate([np.zeros((0, 2), np.int64), *cells]).T
@@ -164,7 +164,7 @@ class OccupancyCoder:
 
 
 def _borders(length: int, num_cells: int) -> list[int]:
-    """Divide a length into bands, so that none has many of `num_cells` cells."""
+    """Divide a length into bands, so that none has too many of the `num_cells` cells."""
     bands = max(_MIN_BANDS, -(-num_cells // _GROUP))
     return sorted({length * i // bands for i in range(bands + 1)})
 
@@ -172,7 +172,7 @@ def _borders(length: int, num_cells: int) -> list[int]:
 def _sum_density(column: Integers, row: Integers, shape: tuple[int, int], first: int, last: int) -> Floats:
     """Sum the density of Gaussians in the cells of rows first to last - 1, mirrored at the grid's borders.
 
-    What a Gaussian adds falls linearly with the distance in columns and in rows: two box filters.
+    The density of a Gaussian falls linearly with the distance in columns and in rows; two box filters do this.
     """
     top, bottom = max(first - _REACH, 0), min(last + _REACH, shape[0])
     is_within = (row >= top) & (row < bottom)
@@ -216,7 +216,7 @@ def _code_cells(
 
 
 def _code_band(coder: Coder, chances: Floats, max_count: int, index: Integers) -> Integers:
-    """Code the cells of at most `max_count` Gaussians: a bit of its chance for each further one in a cell."""
+    """Code the cells of at most `max_count` Gaussians: each bit says whether a cell has one more Gaussian."""
     cells = np.arange(len(chances) if max_count else 0)
     counts = np.bincount(index, minlength=len(chances))
     rounds, total = [cells[:0]], 0

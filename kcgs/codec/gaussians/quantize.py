@@ -1,4 +1,4 @@
-"""Gaussians as whole numbers, each as fine as the image needs it (docs/format.md has the derivation and every step)."""
+"""Gaussians as whole numbers, each as precise as the image needs it (docs/format.md derives every step)."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from .occupancy import Grid
 
 ENERGIES = (-24, 40)  # least and largest class of energy: log2 of the amplitude times the mean standard deviation
 SIZES = (-8, 28)  # least and largest class of size
-OCTAVES = 0.75  # of the mean standard deviation, that a class of size spans
+OCTAVES = 0.75  # octaves of the mean standard deviation that a class of size spans
 QPS = (-512, 1023)  # least and largest quantization parameter
-QP_PER_OCTAVE = 32  # of the distortion, D = 2^(-qp / 32)
-MAX_RATIO = 12.0  # half the log2 of the ratio of standard deviations
-_MAX_STEPS = 1 << 20  # of a scale, a ratio, an angle or a place
-_MAX_COLOR = 1 << 24  # steps of a colour
-_MIN_AMPLITUDE = 1e-12  # of a colour, as black has no energy
+QP_PER_OCTAVE = 32  # quantization parameters per octave of the distortion, D = 2^(-qp / 32)
+MAX_RATIO = 12.0  # largest ratio of standard deviations, in half the log2 of it
+_MAX_STEPS = 1 << 20  # most steps of a scale, a ratio, an angle or a place
+_MAX_COLOR = 1 << 24  # steps that a colour stays below
+_MIN_AMPLITUDE = 1e-12  # least amplitude of a colour, since log2 of 0 is not finite
 # rows: grey, red against blue, green against both; orthonormal
 OPPONENT = (
     (0.5773502691896258, 0.5773502691896258, 0.5773502691896258),
@@ -38,7 +38,7 @@ class Parameters(NamedTuple):
 
 
 class Classes(NamedTuple):
-    """The classes of each Gaussian, which determine its steps."""
+    """The two classes of each Gaussian; they determine its steps."""
 
     energy: Integers  # [N]
     size: Integers  # [N]
@@ -47,14 +47,14 @@ class Classes(NamedTuple):
 class Codes(NamedTuple):
     """N Gaussians as whole numbers."""
 
-    energy: Integers  # [N] class
-    size: Integers  # [N] class
-    scale: Integers  # [N] place within the class of size
-    ratio: Integers  # [N] of the standard deviations
-    angle: Integers  # [N] of the longer axis
-    colors: Integers  # [N, C] grey first
-    cell: Integers  # [N, 2] column, row
-    place: Integers  # [N, 2] within the cell: across, down
+    energy: Integers  # [N] class of energy
+    size: Integers  # [N] class of size
+    scale: Integers  # [N] scale within the class of size
+    ratio: Integers  # [N] ratio of the standard deviations
+    angle: Integers  # [N] angle of the longer axis
+    colors: Integers  # [N, C] colour, grey first
+    cell: Integers  # [N, 2] column and row of the cell
+    place: Integers  # [N, 2] place within the cell: across, down
 
     def select(self, index: Any) -> Codes:
         """Return the Gaussians of an index."""
@@ -64,16 +64,16 @@ class Codes(NamedTuple):
 class StepSizes(NamedTuple):
     """The steps of each Gaussian's parameters."""
 
-    size: Integers  # [N] class
-    place: Floats  # [N] in standard deviations
-    num_scales: Integers  # [N] places in a class of size
-    ratio: Floats  # [N] in log2
-    angle: Floats  # [N] radians, times sinh of the log ratio
-    color: Floats  # [N]
-    side: Integers  # [N] of the cells, in pixels, a power of two
+    size: Integers  # [N] class of size
+    place: Floats  # [N] step of a place, in standard deviations
+    num_scales: Integers  # [N] number of scales in a class of size
+    ratio: Floats  # [N] step of a ratio, in log2
+    angle: Floats  # [N] step of an angle in radians, times sinh of the log ratio
+    color: Floats  # [N] step of a colour
+    side: Integers  # [N] side of the cells, in pixels, a power of two
 
     def num_angles(self, ratio: Integers) -> Integers:
-        """Return how many angles there are at each ratio: one for circles."""
+        """Return the number of angles at each ratio: one for circles."""
         log = 2.0 * ratio * self.ratio
         larger, smaller = exp2(np.stack([log, -log]))
         sinh = 0.5 * (larger - smaller)
@@ -91,7 +91,7 @@ class StepSizes(NamedTuple):
         return np.stack([l11, (major * major - minor * minor) * cos * sin / l11, major * minor / l11], -1)
 
     def num_places(self, shape: Floats) -> Integers:
-        """Return how many places a cell has across and down [N, 2]."""
+        """Return the number of places in a cell, across and down [N, 2]."""
         step = self.place[:, None] * shape[:, ::2]
         return np.clip(np.ceil(self.side[:, None] / step), 1, _MAX_STEPS).astype(np.int64)
 
@@ -108,7 +108,7 @@ class StepSizes(NamedTuple):
 
 
 class Quantizer:
-    """Turns Gaussians into whole numbers and back; each adds a squared error of D = 2^(-qp / 32) to the image."""
+    """Turn Gaussians into whole numbers and back; each number adds a squared error of D = 2^(-qp / 32) to the image."""
 
     def __init__(self, qp: int, size: tuple[int, int]) -> None:
         self.qp, self.size = qp, size
@@ -130,7 +130,7 @@ class Quantizer:
         )
 
     def steps(self, classes: Classes) -> StepSizes:
-        """Return the steps at which every parameter adds the distortion; cells are of all Gaussians of a class."""
+        """Return the steps at which every parameter adds the distortion; all Gaussians of a class share a grid."""
         relative: Floats = self._energy_steps[classes.energy - ENERGIES[0]]
         log_scale = relative * (math.sqrt(0.5) / LN2)
         pair = (classes.energy - ENERGIES[0]) * (SIZES[1] - SIZES[0] + 1) + classes.size - SIZES[0]
@@ -174,7 +174,7 @@ class Quantizer:
         return steps.dequantize(codes, steps.shape(codes.scale, codes.ratio, share))
 
     def _locate(self, means: Floats, shape: Floats, steps: StepSizes) -> tuple[Integers, Integers]:
-        """Round x, then y, which makes up for the error of x along the slant of the Gaussian."""
+        """Round x, then y; y makes up for the error of x along the slant of the Gaussian."""
         num_places, side = steps.num_places(shape), steps.side
         sides, index = np.unique(side, return_inverse=True)
         margin = np.array([Grid.of_side(self.size, one).max_margin for one in sides.tolist()], np.int64)[index]
@@ -195,11 +195,11 @@ class Quantizer:
 
 
 def opponent(colors: Floats, *, inverse: bool = False) -> Floats:
-    """Rotate RGB [N, 3] into grey and two opponent colours, or back; other numbers of channels stay."""
+    """Rotate RGB [N, 3] into grey and two opponent colours, or back; do nothing for other numbers of channels."""
     if colors.shape[1] != 3:
         return colors
     rows = tuple(zip(*OPPONENT, strict=True)) if inverse else OPPONENT
-    # a matrix product would have the machine's order of summation
+    # the order of sums in a matrix product would depend on the machine
     return np.stack([colors[:, 0] * a + colors[:, 1] * b + colors[:, 2] * c for a, b, c in rows], -1)
 
 

@@ -1,4 +1,4 @@
-"""The weights of the models of Gaussians at first, measured on photos that no benchmark uses."""
+"""The first weights of the models of Gaussians, measured on photos that no benchmark uses."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from kcgs.codec.exact import Floats
 
-_WEIGHT = 0.05  # Gaussians for which a part of a thousand stands
+_WEIGHT = 0.05  # Gaussians per part of a thousand; larger: the models learn more slowly
 
 
 class Shapes(NamedTuple):

@@ -1,7 +1,7 @@
-"""The context model of label maps: the chances of a pixel, given the pixels before it (docs/format.md).
+"""The context model of label maps: the chances of a pixel's label, given the pixels before it (docs/format.md).
 
-A small network, trained once by `tests/codec/train_prior.py`, is the first estimate. Counters that learn from the map
-correct it. All loops are in integers and compiled by numba: ``>>`` and ``//`` round down.
+A small network, trained once by `tests/codec/train_prior.py`, gives the first estimate. Counters that learn from the
+map correct it. All loops compute with integers and are compiled by numba: ``>>`` and ``//`` round down.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ import numpy as np
 
 from kcgs.compiled.program import inner
 
-# dx of the first and the last pixel of the template in each row, from the pixel's own row upwards
+# dx of the first and the last pixel of the template in each row; the pixel's own row comes first, then the rows above
 _SPANS = ((-8, -1), (-8, 7), (-7, 8), (-6, 7), (-5, 6), (-3, 4), (-2, 3))
 _OFFSETS = [(dx, -dy) for dy, (first, last) in enumerate(_SPANS) for dx in range(first, last + 1)]
 TEMPLATE = sorted(_OFFSETS, key=lambda offset: (offset[0] ** 2 + offset[1] ** 2, -offset[1], offset[0]))
-# units of the two hidden layers of each network: of the maps in scenes, and of files of maps
+# units of the two hidden layers of each network: for maps in scenes, and for files of maps
 PRIORS = {"scene_prior.bin": (48, 16), "map_file_prior.bin": (96, 32)}
 
 LEFT = 8  # columns of the margin at the left of a map, in labels
 RIGHT = 9  # columns of the margin at its right
 TOP = 6  # rows of the margin above it
 DECISIONS = 2  # 0: second candidate rather than the first; 1: neither candidate
-COUNTERS = 3  # that a decision reads
+COUNTERS = 3  # counters per decision
 ESTIMATES = 1 + COUNTERS  # logits that are mixed: of the network, then of the counters
 PIXEL = np.dtype(
     [
@@ -34,22 +34,23 @@ PIXEL = np.dtype(
         ("first", np.int32),  # candidate
         ("second", np.int32),  # candidate
         ("label", np.int32),
-        ("features", np.int32, len(TEMPLATE)),  # 0: has the first candidate, 1: the second, 2: neither
+        ("features", np.int32, len(TEMPLATE)),  # label of a neighbour: 0: first candidate, 1: second, 2: neither
         ("estimates", np.int32, (DECISIONS, ESTIMATES)),  # logits, in 1/256
-        ("counters", np.int32, (DECISIONS, COUNTERS)),  # their rows in the table of counters
-        ("weights", np.int32, DECISIONS),  # which set of the mixer's weights
-        ("chance", np.int32, DECISIONS),  # of a 1, in 1/65536
+        ("counters", np.int32, (DECISIONS, COUNTERS)),  # rows in the table of counters
+        ("weights", np.int32, DECISIONS),  # index of the set of the mixer's weights
+        ("chance", np.int32, DECISIONS),  # chance of a 1, in 1/65536
     ]
 )
 
 MAX_LOGIT = 3071  # in 1/256
 _MAX_UNIT = 4095  # largest activation of a hidden unit, in 1/64
-# counters of each context: of decision 0 by two values of 6, 11 and 16 features; of decision 1 by three of 0, 4 and 8
+# number of contexts of each counter: decision 0 reads 2 values of 6, 11 and 16 features, decision 1 reads 3 values of
+# 0, 4 and 8 features
 _CONTEXT_SIZES = (2**6, 2**11, 2**16, 3**0, 3**4, 3**8)
 _BASES = np.cumsum((0, *_CONTEXT_SIZES[:-1])).reshape(DECISIONS, COUNTERS).astype(np.int32)
-_MIXER_RATE = 6  # of the mixer's steps, before _MIXER_SHIFT
+_MIXER_RATE = 6  # learning rate of the mixer, before _MIXER_SHIFT
 _MIXER_SHIFT = 18  # bits
-_MAX_WEIGHT = 1 << 22  # of the mixer, in 1/65536
+_MAX_WEIGHT = 1 << 22  # largest weight of the mixer, in 1/65536
 _WEIGHT_SETS = 4  # by the age of a decision's third counter: 0, below _YOUNG, below _OLD, or more
 _YOUNG = 5  # bits
 _OLD = 12  # bits
@@ -66,7 +67,7 @@ def layout(hidden: int, latent: int) -> list[tuple[str, tuple[int, ...]]]:
 
 
 def load_prior(name: str) -> tuple[Any, ...]:
-    """Read tables that come with the package, as int32, in the order of `layout`."""
+    """Read the package's tables of a network, as int32, in the order of `layout`."""
     data = resources.files(__package__).joinpath(name).read_bytes()
     tables = np.frombuffer(data, [("", kind, shape) for kind, shape in layout(*PRIORS[name])])[0]
     return tuple(table.astype(np.int32) for table in tables)
@@ -82,8 +83,8 @@ def new_mixer(prior: tuple[Any, ...]) -> Any:
     return np.tile(prior[-1], (DECISIONS, _WEIGHT_SETS, 1))
 
 
-# constants of the loops. Only the middle value of SQUASH lies within 1e-6 of a half before it is rounded, so that any
-# machine's exp gives the same table
+# Constants of the loops. Before rounding, only the middle value of SQUASH is within 1e-6 of a half, so that any
+# machine's exp gives the same table.
 _DX = np.array([dx for dx, _ in TEMPLATE], np.int32)
 _DY = np.array([dy for _, dy in TEMPLATE], np.int32)
 SQUASH = np.rint(65536 / (1 + np.exp(np.arange(MAX_LOGIT, -MAX_LOGIT - 1, -1) / 256))).astype(np.int32)
@@ -123,16 +124,16 @@ def find_features(labels, pixel):
 
 
 def make_network(prior: tuple[Any, ...]) -> Any:
-    """Compile a network: two layers of rectified sums give the first estimate of each decision.
+    """Compile a network: two hidden layers with rectified sums give the first estimate of each decision.
 
-    Its tables are constants of the loops: as arguments they would slow them down.
+    The network's tables are constants of its loops: as arguments they would slow the loops down.
     """
     layer1, bias1, layer2, bias2, layer3, bias3, _ = prior
     num_hidden, num_latent = layer2.shape
 
     @inner
     def network(pixel, units):
-        # lengths unknown to the compiler: it would unroll loops of known length, without vectors, and be 3 times slower
+        # the compiler must not know these lengths: it would unroll the loops, without vectors, 3 times slower
         latent, hidden = units[: len(units) - num_hidden], units[num_latent:]
         features, estimates = pixel.features, pixel.estimates
         for j in range(len(hidden)):
@@ -166,7 +167,7 @@ file_network = make_network(load_prior("map_file_prior.bin"))
 
 @inner
 def find_counters(pixel):
-    """Fill in the counters of a pixel: those of the contexts that its features are in."""
+    """Fill in the counters of a pixel: its features select the contexts."""
     features, counters = pixel.features, pixel.counters
     bits = 0
     for t in range(1, 17):

@@ -1,4 +1,4 @@
-"""The ids of a map's regions, in the order in which wavefronts meet them (docs/format.md, "Regions and ids")."""
+"""The ids of a map's regions, in the order in which wavefronts reach them (docs/format.md, "Regions and ids")."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ import numpy as np
 from kcgs.codec.adaptive import AdaptiveSymbol
 from kcgs.codec.rangecoder import CodecError, Coder
 
-_COUNT_BITS = 24  # of the number of regions
-_MASK_IDS = [0, 255]  # of many masks
-# of the counts of bits of distances between ids, at first: 0, 1 to 16, and more
+_COUNT_BITS = 24  # bits of the number of regions
+_MASK_IDS = [0, 255]  # common ids of masks
+# first weights of the counts of bits of distances between ids: 0, 1 to 16, and more
 _LENGTH_WEIGHTS = np.array([8.0, *[1.0] * 16, *[0.125] * 47])
 
 
 def code_ids(coder: Coder, ids: list[int], max_count: int, *, is_file: bool) -> list[int]:
-    """Code the ids in the order in which wavefronts meet their regions; a reader's list is empty.
+    """Code the ids in the order in which wavefronts reach their regions; a reader's list is empty.
 
-    Those of a file of its own take fewer bytes: 0 to R - 1, 0 and 255, or any; then whether they rise in their order;
-    the order.
+    A file of a label map has a shorter code: whether the ids are 0 to R - 1, 0 and 255, or any others, and whether
+    they rise in this order; if not, the order follows.
     """
     count = _code_count(coder, len(ids), max_count)
     if is_file:
@@ -55,7 +55,7 @@ def _code_count(coder: Coder, count: int, max_count: int) -> int:
 
 
 def _code_rising(coder: Coder, ids: list[int], count: int, code_distance: Callable[[int], int]) -> list[int]:
-    """Code rising ids, each as its distance from the one before, less 1."""
+    """Code rising ids, each as its distance from the previous id, minus 1."""
     rising, last = [], -1
     for i in range(count):
         last += 1 + code_distance(0 if coder.is_reader else ids[i] - last - 1)
@@ -66,7 +66,7 @@ def _code_rising(coder: Coder, ids: list[int], count: int, code_distance: Callab
 
 
 def _code_order(coder: Coder, ids: list[int], rising: list[int]) -> list[int]:
-    """Code which of the remaining ids each region has; `rising` are all of them."""
+    """Code which of the remaining ids each region has; `rising` lists all ids."""
     count = len(rising)
     remaining, positions, order = RankTree(count), {region: i for i, region in enumerate(sorted(ids))}, []
     for i in range(count):
@@ -78,7 +78,7 @@ def _code_order(coder: Coder, ids: list[int], rising: list[int]) -> list[int]:
 
 
 class RankTree:
-    """A Fenwick tree over positions 0 to count - 1, which are removed one by one: millions take seconds."""
+    """A Fenwick tree over the positions 0 to count - 1; removing millions one by one takes seconds."""
 
     def __init__(self, count: int) -> None:
         self._tree = [i & -i for i in range(count + 1)]
@@ -92,7 +92,7 @@ class RankTree:
         return rank
 
     def remove(self, rank: int) -> int:
-        """Remove the position of this rank among the remaining ones, and return it."""
+        """Remove the position of this rank among the remaining positions, and return it."""
         position, step = 0, 1 << len(self._tree).bit_length()
         while step := step >> 1:
             if position + step >= len(self._tree):

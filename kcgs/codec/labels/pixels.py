@@ -13,8 +13,8 @@ from .contexts import LEFT, TOP
 from .seeds import code_seeds
 from .wavefront import MAX_NEAREST, Scan, advance, find_nearest, new_scan
 
-# limits on the work of a decoder: seconds
-MAX_CODED = 1 << 23  # pixels that bits decide
+# limits that keep the work of a decoder to seconds
+MAX_CODED = 1 << 23  # pixels decided by bits
 MAX_ESCAPES = 1 << 18  # labels of seeds, and of pixels that have neither candidate
 
 
@@ -27,10 +27,10 @@ def code_pixels(coder: Coder, truth: Any, seeds: Any, num_regions: int, *, is_fi
 
     Args:
         coder: of the stream.
-        truth: (H, W) int32; a decoder's is empty.
+        truth: number of each pixel's region, (H, W) int32; empty for a decoder.
         seeds: (H, W) uint8, 1 where a pixel is a seed; a decoder fills them in.
         num_regions: at least 2.
-        is_file: whether the map is a file of its own.
+        is_file: whether this is the file of a label map, not of a scene.
     """
     code_seeds(coder, seeds)
     height, width = seeds.shape
@@ -51,18 +51,18 @@ def code_pixels(coder: Coder, truth: Any, seeds: Any, num_regions: int, *, is_fi
 
 
 class _Escapes:
-    """Codes labels of seeds, and of pixels that have neither candidate, in maps of three regions or more."""
+    """Code labels of seeds, and of pixels that have neither candidate, in maps of three regions or more."""
 
     def __init__(self, coder: Coder, scan: Scan, num_regions: int) -> None:
         self._coder, self._labels, self._num_regions = coder, scan.labels, num_regions
-        self._num_met = 1  # regions that have a pixel already
+        self._num_met = 1  # regions that already have a pixel
         self._count = 0
-        # of seeds, and of coded pixels
+        # models of seeds, and of coded pixels
         self._is_new = [AdaptiveBit(), AdaptiveBit()]
         self._is_nearest = [[AdaptiveBit() for _ in range(MAX_NEAREST)] for _ in range(2)]
 
     def code(self, pixels: Any, has_neither: Any) -> None:
-        """Code the labels of a wavefront's escapes; `has_neither` is of its coded pixels."""
+        """Code the labels of a wavefront's escapes; `has_neither` marks the coded pixels with neither candidate."""
         is_escape = pixels["is_coded"] == 0
         is_escape[~is_escape] = has_neither
         self._count += int(is_escape.sum())

@@ -1,4 +1,4 @@
-"""Which pixels of a map are seeds, by how many lie in each half of ever smaller blocks (docs/format.md, "Seeds")."""
+"""The seeds of a map, coded as their numbers in the halves of ever smaller blocks (docs/format.md, "Seeds")."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def _halves(block: Any) -> tuple[Any, Any]:
 
 
 def _code_count(coder: Coder, first: Any, second_size: int, count: int, is_extreme: AdaptiveBit) -> int:
-    """Code how many of a block's seeds are in its first half: as few as can be, as many, or a number between."""
+    """Code the number of a block's seeds in its first half: the least possible, the largest, or one between."""
     low, high = max(0, count - second_size), min(count, first.size)
     if low == high:
         return low

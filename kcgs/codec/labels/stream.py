@@ -1,4 +1,4 @@
-"""The stream of a label map without loss, a few hundred bytes for a photo's regions (docs/format.md, "Labels")."""
+"""The lossless stream of a label map, a few hundred bytes for a photo's regions (docs/format.md, "Labels")."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from .ids import code_ids
 from .pixels import WorkLimitError, code_pixels
 from .wavefront import number_regions
 
-_NOISE_CHANCE = np.array([2.0**-10])  # that a map is coded as noise
-_NOISE_OVERHEAD = 64  # bits by which the model may exceed noise
-# a map of more regions, and of more than so many per byte, is noise; an encoder's takes more bytes
+_NOISE_CHANCE = np.array([2.0**-10])  # chance that a map is coded as noise
+_NOISE_OVERHEAD = 64  # bits by which the model's stream may exceed that of noise
+# a decoder refuses a map with more regions than both limits: an encoder writes no such map
 _FREE_REGIONS = (1 << 18) + 1
 _REGIONS_PER_BYTE = 4
 
 
 def encode_stream(ids: Integers, index: Any, *, is_file: bool) -> bytes:
-    """Write a map, (H, W) int32 positions among its sorted ids, without its height and width.
+    """Write a map, (H, W) int32 indices into its sorted ids, without its height and width.
 
-    `is_file` says whether the map is a file of its own, or that of a scene, which has other models.
+    `is_file`: the file of a label map; False: the map of a scene, which has other models.
     """
     truth, seeds, order = number_regions(index, len(ids))
     numbered = ids[order].tolist()
@@ -39,14 +39,14 @@ def encode_stream(ids: Integers, index: Any, *, is_file: bool) -> bytes:
         if 8 * len(data) <= index.size * math.log2(len(ids)) + _NOISE_OVERHEAD:
             return data
     except WorkLimitError:
-        pass  # noise, or nearly
+        pass  # the map is close to noise
     writer = _start(numbered, is_file, is_noise=True)
     writer.numbers(truth.reshape(-1), len(ids), index.size)
     return writer.finish()
 
 
 def _start(numbered: list[int], is_file: bool, *, is_noise: bool) -> Writer:
-    """Return a writer of what precedes the pixels."""
+    """Return a writer that has written all that precedes the pixels."""
     writer = Writer()
     code_ids(writer, numbered, len(numbered), is_file=is_file)
     if len(numbered) > 1:
@@ -55,7 +55,7 @@ def _start(numbered: list[int], is_file: bool, *, is_noise: bool) -> Writer:
 
 
 def decode_ids(data: bytes, size: tuple[int, int], max_regions: int, *, is_file: bool) -> tuple[Reader, Integers]:
-    """Read the ids of a map, in the order in which regions are numbered; return the reader of its pixels, too."""
+    """Read the ids of a map, in the order of the regions' numbers; return them and the reader of its pixels."""
     reader, max_of_bytes = Reader(data), max(_FREE_REGIONS, _REGIONS_PER_BYTE * len(data))
     ids = code_ids(reader, [], min(max_regions, max_of_bytes, size[0] * size[1]), is_file=is_file)
     return reader, np.array(ids, np.int64)
@@ -71,7 +71,7 @@ def decode_numbers(reader: Reader, size: tuple[int, int], num_regions: int, *, i
 
 
 def label_pixels(ids: NDArray[Any], numbers: Any) -> NDArray[Any]:
-    """Return the id of each pixel, (H, W) in the type of `ids`, for the numbers of regions, (H, W) of any strides."""
+    """Return the id of each pixel, (H, W) in the dtype of `ids`; `numbers` are those of regions, of any strides."""
     labels = np.empty(numbers.shape, ids.dtype)
     for rows in row_slices(*numbers.shape):
         labels[rows] = ids[numbers[rows]]

@@ -1,6 +1,6 @@
-"""A label map from wavefront to wavefront: which pixels are coded, their chances, and what the model learns.
+"""The pass over a label map, wavefront by wavefront: find the coded pixels, estimate chances, learn from the bits.
 
-A wavefront is the pixels of equal x + 8 y; the chances of its bits depend on earlier wavefronts only (docs/format.md).
+A wavefront has the pixels of equal x + 8 y; the chances of its bits depend only on earlier wavefronts (docs/format.md).
 A row continues with its last label until a decision changes it, so that only pixels near contours cost time.
 """
 
@@ -30,40 +30,40 @@ from .contexts import (
 )
 
 SLANT = 8  # pixels (x, y) of equal x + SLANT * y make a wavefront
-MAX_NEAREST = 3  # nearest labels that the label of an escape is compared with
-_MAX_RADIUS = 32  # of the search for nearest labels, in pixels
-_AHEAD = 128  # pixels that a row is written ahead: written to its end, each change would cost its width
+MAX_NEAREST = 3  # number of nearest labels that an escape's label is compared with
+_MAX_RADIUS = 32  # radius of the search for nearest labels, in pixels
+_AHEAD = 128  # pixels of a row that are written ahead; if all were, each change would cost a whole row
 
 STATE = np.dtype(
     [
-        ("front", np.int64),  # the present wavefront, x + SLANT * y
-        ("num_pixels", np.int64),  # of the wavefront that are seeds or coded
-        ("num_coded", np.int64),  # of these, pixels that bits decide
-        ("num_regions", np.int64),  # of the map
-        ("is_file", np.int64),  # 1: the network of files of maps; 0: that of scenes
+        ("front", np.int64),  # the current wavefront, x + SLANT * y
+        ("num_pixels", np.int64),  # seeds and coded pixels of the wavefront
+        ("num_coded", np.int64),  # pixels of the wavefront that bits decide
+        ("num_regions", np.int64),  # regions of the map
+        ("is_file", np.int64),  # 1: the network for files of maps; 0: the network for scenes
     ]
 )
 _LINE = np.dtype(
     [
-        ("change", np.int32),  # column of the last pixel that differs from the one before
+        ("change", np.int32),  # column of the last pixel whose label differs from that of its left neighbour
         ("seed", np.int32),  # column of the next seed
-        ("wake", np.int32),  # the wavefront until which all pixels are quiet
-        ("end", np.int32),  # column up to which the last label is written
+        ("wake", np.int32),  # all pixels are quiet until this wavefront
+        ("end", np.int32),  # the last label is written up to this column
     ]
 )
 
 
 class Scan(NamedTuple):
-    """What a pass over a map of height H and width W reads and writes."""
+    """The arrays that a pass over a map of height H and width W reads and writes."""
 
     state: Any  # STATE
     labels: Any  # [TOP + H + 1, LEFT + W + RIGHT] the labels so far, and margins
     seeds: Any  # [H, W] uint8, 1 where a pixel is a seed
     lines: Any  # [TOP + H + 2] _LINE, of each row of the labels
-    pixels: Any  # [H] PIXEL, of the present wavefront
+    pixels: Any  # [H] PIXEL, of the current wavefront
     units: Any  # the network's hidden units
-    counters: Any  # of the context model
-    mixer: Any  # its weights
+    counters: Any  # the counters of the context model
+    mixer: Any  # the weights of its mixer
     chances: Any  # [2 H] float64, of the wavefront's bits
     answers: Any  # [2 H] int32, the bits, where the map is known
 
@@ -93,9 +93,9 @@ program = Program("label coder")
 
 @program.entry
 def advance(scan, bits, truth):
-    """Label the present wavefront by its bits, go on to the next that has seeds or coded pixels, return their number.
+    """Label the current wavefront by its bits; go to the next one with seeds or coded pixels; return their number.
 
-    `truth` holds the regions' numbers; a decoder's is empty.
+    `truth` has the number of each pixel's region; it is empty for a decoder.
     """
     height, width = scan.seeds.shape
     state = scan.state
@@ -138,7 +138,7 @@ def _label_pixels(scan, bits):
 
 @inner
 def _find_pixels(scan):
-    """List the seeds and coded pixels of a wavefront; the others have their label, since rows continue."""
+    """List the seeds and coded pixels of a wavefront; its other pixels continue the label of their row."""
     labels, seeds, lines, state = scan.labels, scan.seeds, scan.lines, scan.state
     height, width = seeds.shape
     front = state.front
@@ -167,7 +167,7 @@ def _find_pixels(scan):
         if quiet:
             pixel.first = labels[y, x - 1]
             pixel.second = -1
-            pixel.label = 1 - pixel.first  # the other one of two regions; of more, the escape overwrites it
+            pixel.label = 1 - pixel.first  # the other of two regions; with more regions the escape overwrites it
         else:
             find_features(labels, pixel)
             state.num_coded += 1
@@ -175,7 +175,7 @@ def _find_pixels(scan):
 
 @inner
 def _is_still_quiet(labels, lines, y, x):
-    """Return what `is_quiet` does, by the last change in each row, which in the row above is within its reach."""
+    """Return the value of `is_quiet`, faster: in most cases the last change in each row decides it."""
     if y < TOP + 2:
         return is_quiet(labels, y, x)
     label = labels[y, x - 1]
@@ -204,7 +204,7 @@ def _fill_margins(labels, y, x, label):
 
 @inner
 def _estimate(scan, truth):
-    """Fill in chances, and answers where the truth is known: first whether pixels escape, then which candidate."""
+    """Fill in chances, and answers if the truth is known: first whether pixels escape, then which candidate wins."""
     state, chances, answers = scan.state, scan.chances, scan.answers
     num_escapes = state.num_coded if state.num_regions > 2 else 0
     bit = 0
@@ -228,7 +228,7 @@ def _estimate(scan, truth):
 
 @program.entry
 def find_nearest(labels, pixel, nearest):
-    """Fill in up to MAX_NEAREST labels other than the candidates, by distance from a pixel; return their number."""
+    """Fill in the MAX_NEAREST labels nearest to a pixel, except its candidates; return how many were found."""
     count = 0
     for radius in range(1, _MAX_RADIUS + 1):
         for j in range(-radius, 1):
@@ -251,9 +251,9 @@ def find_nearest(labels, pixel, nearest):
 
 @program.entry
 def number_regions(index, num_regions):
-    """Number the regions as wavefronts meet them, and mark seeds.
+    """Number the regions in the order in which wavefronts reach them, and mark seeds.
 
-    Returns the number of each pixel's region, the seeds, and the position of each numbered region in `index`.
+    Returns the number of each pixel's region, the seeds, and for each number the region's value in `index`.
     """
     height, width = index.shape
     number = np.full(num_regions, -1, np.int32)

@@ -1,8 +1,8 @@
-"""What happens to a fit besides its steps.
+"""The events of a fit: they act between its steps.
 
-An event that changes the scene is a frozen dataclass whose fields are its thresholds; whatever it counts is a field of
-:class:`~kcgs.fitting.state.FitState`, which a checkpoint keeps. Gaussians are added and removed
-by ``append`` and ``keep`` of the state's optimizer. Others observe.
+An event that changes the scene is a frozen dataclass, and its fields are thresholds. What it counts is a field of
+:class:`~kcgs.fitting.state.FitState`, which a checkpoint stores. It adds and removes Gaussians by ``append`` and
+``keep`` of the state's optimizer. Other events only observe.
 """
 
 from .contours import AdaptContours, SettleContours

@@ -1,4 +1,4 @@
-"""Contours that follow the image while Gaussians are added, and after that."""
+"""The events that move contours, during and after densification."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from kcgs.fitting.state import FitState
 from kcgs.functional import RegionMap
 from kcgs.optim import Gaussians
 
-# of the clock of a fit so far: what moves of the contours may take
+# largest share of the time of a fit so far that moves of the contours may take
 _CLOCK_SHARE = 0.25
 # seconds per pixel that the first move is expected to take
 _SECONDS_PER_PIXEL = 3e-7
@@ -24,20 +24,17 @@ _SECONDS_PER_PIXEL = 3e-7
 
 @dataclass(frozen=True)
 class AdaptContours:
-    """Move the contours before some of the additions of Gaussians, which then adapt to the new contours.
-
-    The event `Densify` does this.
-    """
+    """Move the contours before some additions of Gaussians; the event `Densify` calls it."""
 
     max_rise: float = 1.5
-    """Factor by which a move may raise the squared error about it."""
+    """Factor by which a move may raise the squared error around it; the Gaussians adapt to it later."""
     additions_per_move: int = 2
     """Contours move before every second addition."""
     additions_per_softness: int = 4
-    """Before every fourth addition their softness is chosen anew, where the settings ask for it."""
+    """The softness of contours is chosen again before every fourth addition, if the settings ask for it."""
 
     def adapt(self, state: FitState) -> None:
-        """Move the contours, and at times choose their softness, if that is due before this addition."""
+        """Move the contours, and choose their softness, where this is due before the current addition."""
         if state.num_additions % self.additions_per_move:
             return
         _move_contours(state, self.max_rise)
@@ -56,13 +53,13 @@ def _replace_maps(state: FitState, replace: Callable[[FitState, int, RegionMap],
 
 
 def _choose_softness(state: FitState, image: int, regions: RegionMap) -> RegionMap:
-    """Choose the softness of contours anew, where the settings ask for it."""
+    """Choose the softness of contours again, if the settings ask for it."""
     problem = state.problem
     return with_chosen_softness(problem.canvas[image], regions) if problem.chooses_softness(image) else regions
 
 
 def _move_contours(state: FitState, max_rise: float) -> None:
-    """Move the contours where that raises the squared error about them by no more than a factor."""
+    """Move the contours where this raises the squared error around them at most by the factor `max_rise`."""
     images, anchor, config = state.problem.image, state.anchor, state.problem.config
     if state.regions is None or anchor is None or images is None or not _has_time(state):
         return
@@ -78,7 +75,7 @@ def _move_contours(state: FitState, max_rise: float) -> None:
 
 
 def _has_time(state: FitState) -> bool:
-    """Whether another move of the contours keeps to their share of the clock, where there is one."""
+    """Whether the clock, if there is one, has time for another move of the contours."""
     max_seconds, seconds = state.problem.config.max_seconds, state.contour_seconds
     if max_seconds is None:
         return True
@@ -88,7 +85,7 @@ def _has_time(state: FitState) -> bool:
 
 @dataclass(frozen=True)
 class SettleContours:
-    """Move the contours a few times after densification, where that lowers the error at once."""
+    """Move the contours a few times after densification, where this lowers the error at once."""
 
     after: float
     """Share of the fit at the end of densification."""

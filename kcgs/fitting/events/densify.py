@@ -1,4 +1,4 @@
-"""Gaussians are added where the error is, and removed where that costs least."""
+"""The event that adds Gaussians where the error is large, and removes those of the lowest impact."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from .contours import AdaptContours
 class Densify:
     """Add Gaussians where they lower the squared error most, by matching pursuit.
 
-    First their number grows to more than N. Then come cycles: in each, those that cost least are removed, step by step,
-    until there are N, and the next cycle adds as many again. So N places are chosen several times, each time with
-    knowledge of the others.
+    First the number of Gaussians grows beyond N. Then cycles follow: each removes Gaussians of the lowest impact, in
+    several steps, until N are left, and the next cycle adds as many again. So the positions of N Gaussians are chosen
+    several times, each time given the others.
     """
 
     contours: AdaptContours | None = None
@@ -31,16 +31,16 @@ class Densify:
     end: float = 0.4
     """Share of the fit when the number of Gaussians is largest for the first time."""
     surplus: float = 0.2
-    """Gaussians beyond N at the peak, as a share of N; 0 where all exist from the start."""
+    """Gaussians beyond N at the peak, as a share of N; not used if all N exist from the start."""
     settled: float = 0.8
-    """Share of the fit from which on there are N."""
+    """Share of the fit after which there are N."""
     cycle: int = 100
     """About how many iterations a cycle takes."""
     removals: int = 4
     """Number of removals in a cycle."""
 
     def target(self, state: FitState, first: int) -> int:
-        """Return the number of Gaussians that the schedule asks for, of an image that began with `first`."""
+        """Return the number of Gaussians that the schedule asks for, for an image that began with `first`."""
         final, progress = state.problem.num_gaussians, state.progress
         surplus = self.surplus if state.problem.config.densify_from < 1.0 else 0.0
         most = round((1 + surplus) * final)
@@ -59,8 +59,8 @@ class Densify:
 
     @torch.no_grad()
     def act(self, state: FitState) -> None:
-        """Add or remove Gaussians where the schedule asks for another number, once a state was measured."""
-        if state.num_cycles == 0 and state.progress >= self.end:  # from here on a clock changes it no more
+        """Add or remove Gaussians if the schedule asks for another number and the history has an entry."""
+        if state.num_cycles == 0 and state.progress >= self.end:  # fixed from now on, also in a fit with a clock
             state.num_cycles = self._num_cycles(state)
         target = self.target(state, state.num_initial)
         if not state.history or target == state.num_requested:
@@ -75,6 +75,6 @@ class Densify:
         state.num_requested = target
 
     def add(self, state: FitState, count: int) -> None:
-        """Add so many Gaussians, if any; fewer to images that began with fewer than others, as they would alone."""
+        """Add `count` Gaussians; images that began with fewer Gaussians than others get fewer, as in a fit alone."""
         most = self.target(state, state.num_initial)
         add_gaussians(state, count, [most - self.target(state, first) for first in state.initial_counts])

@@ -1,4 +1,4 @@
-"""The end of a fit whose numbers are not finite."""
+"""The event that handles numbers that are not finite."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from kcgs.fitting.steppers import Stepper
 
 
 class HandleDivergence:
-    """Excludes images with a number that is not finite, or too large; ends a fit of which no other image is left."""
+    """Exclude images with a number that is not finite or too large; end the fit when no image is left."""
 
     def __init__(self, stepper: Stepper) -> None:
         self._stepper = stepper
 
     def act(self, state: FitState) -> str | None:
-        """Check, and return why the fit ends."""
+        """Exclude overflowing images; return "diverged" when no image is left."""
         state.exclude(self._stepper.overflowing_images())
         return "diverged" if state.all_diverged else None

@@ -9,7 +9,7 @@ from kcgs.fitting.state import FitState
 
 @dataclass(frozen=True)
 class EndDrafts:
-    """Render with the cutoff of the result from here on."""
+    """Render with the cutoff of the result after a share of the fit."""
 
     after: float = 0.85
     """Share of the fit that renders with the draft cutoff."""

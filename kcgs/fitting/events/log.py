@@ -6,19 +6,19 @@ from kcgs.fitting.clock import Clock
 from kcgs.fitting.state import FitState
 from kcgs.fitting.steppers import Stepper
 
-# least number of entries of a history, if there are as many iterations
+# least number of history entries, if there are as many iterations
 _HISTORY_LENGTH = 100
 
 
 class Log:
-    """Measures the scene 100 to 200 times per fit, when there are no more than N Gaussians."""
+    """Measure the scene 100 to 200 times per fit, but only while there are at most N Gaussians."""
 
     def __init__(self, stepper: Stepper, clock: Clock) -> None:
         self._stepper, self._clock = stepper, clock
-        self._next = 0.0  # progress, where a clock ends the fit
+        self._next = 0.0  # progress of the next measurement, in a fit with a clock
 
     def act(self, state: FitState) -> None:
-        """Measure, if it is time to."""
+        """Measure the scene, if it is time to."""
         config = state.problem.config
         if config.max_seconds is None:
             if state.iteration % max(1, config.planned_iterations // _HISTORY_LENGTH):

@@ -1,4 +1,4 @@
-"""The news of a fit after every step: its history, a bar, the user's callback, a checkpoint."""
+"""The event that reports each step: to the history, a progress bar, the user's callback and a checkpoint."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ OnStep = Callable[[int, HistoryEntry], bool | None]
 
 
 class Report:
-    """Reports every step once a scene was measured; ends the fit where the callback returns True.
+    """Report every step after the first measurement; end the fit when the callback returns True.
 
     Args:
         stepper: of the fit.
         clock: of the fit.
         bar: shows the last measurement.
         on_step: the user's callback.
-        checkpoint: keeps the state.
+        checkpoint: stores the state.
     """
 
     def __init__(
@@ -33,12 +33,12 @@ class Report:
         self._has_stepped = False
 
     def act(self, state: FitState) -> str | None:
-        """Record what was measured, and report it."""
+        """Record the measurements that have arrived, and report the last one."""
         if not self._has_stepped:
             self._has_stepped = True
             return None
         self._stepper.poll()
-        if not state.history:  # an event may add more than N Gaussians at once, which are not measured
+        if not state.history:  # a user's event may add more than N Gaussians at once: such scenes are not measured
             return None
         entry = state.history[-1]
         self._bar.update(

@@ -11,8 +11,8 @@ from torch.optim.optimizer import Optimizer, ParamsT
 class Adan(Optimizer):
     """Adaptive Nesterov momentum: averages of the gradient, of its change, and of the squared look-ahead.
 
-    As in the authors' release the betas weigh the past (the paper writes one minus them), the averages start at zero
-    and are corrected for it, and the gradient before the first is the first.
+    As in the authors' release, the betas are the weights of the past (the paper's betas are 1 minus these). The
+    averages start at zero, with a correction for this. At the first step the change of the gradient is zero.
 
     Source: Xie et al., "Adan: Adaptive Nesterov Momentum Algorithm", 2022, Algorithm 1 without its restarts.
     """

@@ -12,18 +12,18 @@ from kcgs.optim import ReparametrizedOptimizer
 
 from .adan import Adan
 
-# tanh reaches it
+# largest argument of atanh, which is infinite at 1
 _EDGE = 1.0 - 1e-6
-# pixels: thinner Gaussians fall between the pixel centres
+# least standard deviation, in pixels: thinner Gaussians fall between the pixel centres
 _MIN_SIGMA = 0.1
 
 
 class GaussianImageAdan(ReparametrizedOptimizer):
     """Adan on centres through tanh, and on Cholesky factors and colours as they are.
 
-    The learning rate, 1e-3, is that of 50,000 iterations; a shorter fit takes larger steps, by the root of the ratio,
-    up to twentyfold. Steps of the factors scale with `sigma`, the size of the
-    Gaussians at the start. A factor's columns may change sign in the descent, which leaves the covariance as it is.
+    The learning rate of 1e-3 is for 50,000 iterations. A shorter fit multiplies it by the square root of the ratio of
+    iterations, at most by 20. Steps of the factors scale with `sigma`, the size of the Gaussians at the start. A
+    factor's columns may change sign in the descent; the covariance stays the same.
 
     Source: Zhang et al., "GaussianImage: 1000 FPS Image Representation and Compression by 2D Gaussian Splatting", 2024.
     """
@@ -32,9 +32,9 @@ class GaussianImageAdan(ReparametrizedOptimizer):
     full_iterations = 50_000
     max_rate_factor = 20.0
     half_life = 0.4
-    """Share of a fit after which the rates halve."""
+    """Share of a fit between two halvings of the rates."""
     max_sigma = 10.0
-    """The widest that a Gaussian may be, in image diagonals."""
+    """Largest standard deviation of a Gaussian, in image diagonals."""
 
     def __init__(self, field: GaussianField, sigma: float, iterations: int, rate_factor: float) -> None:
         speedup = min(self.max_rate_factor, math.sqrt(max(1.0, self.full_iterations / iterations)))
@@ -52,12 +52,12 @@ class GaussianImageAdan(ReparametrizedOptimizer):
         """Return the centres before tanh, factors and colours."""
         means, cholesky, colors = field.means.detach(), field.cholesky.detach(), field.merged_colors().detach()
         centres = (2 * means / self.extent - 1).clamp(-_EDGE, _EDGE)
-        # one image after the other: the last bit of torch's atanh depends on a number's place in memory
+        # image by image: the last bit of torch's atanh depends on a number's place in memory
         parts = [torch.atanh(image) for image in centres.view(-1, *centres.shape[-2:])]
         return [torch.stack(parts).view_as(centres), cholesky, colors]
 
     def decode(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return means, cholesky with positive diagonal, colors."""
+        """Return means, Cholesky factors with a positive diagonal, and colours."""
         centres, factors, colors = self.parameters
         means = 0.5 * (torch.tanh(centres) + 1) * self.extent
         l11, l21, l22 = factors.unbind(-1)

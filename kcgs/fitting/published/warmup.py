@@ -12,7 +12,7 @@ from kcgs.functional import lookup_regions
 
 @dataclass(frozen=True)
 class Warmup:
-    """Read the region ids again under the moving centres, as the paper does; by iterations, whatever the clock says."""
+    """Look up the region ids under the moving centres again, as in the paper; counted in iterations, not in time."""
 
     every: float = 0.02
     """Share of the iterations between refreshes."""
@@ -20,7 +20,7 @@ class Warmup:
     """Share of the iterations after which the ids are frozen."""
 
     def act(self, state: FitState) -> None:
-        """Read the ids, but leave no region without its last Gaussian: nothing else would feel the error there."""
+        """Look up the ids, but empty no region: without a Gaussian, its error would have no gradient."""
         field, regions, iterations = state.field, state.regions, state.problem.config.planned_iterations
         is_turn = state.iteration % max(1, round(self.every * iterations)) == 0
         if regions is None or not is_turn or not 0 < state.iteration <= self.until * iterations:

@@ -14,8 +14,8 @@ __all__ = ["CudaStepper", "EagerStepper", "Stepper", "make_stepper"]
 def make_stepper(state: FitState) -> Stepper:
     """Return the stepper of a fit's device and optimizer.
 
-    On a GPU steps of GaussianAdam are not waited for: it leaves out gradients of NaN, those of a step that the device
-    had no room for. Other optimizers do not.
+    On a GPU the host does not wait for steps of GaussianAdam. A step that finds no room on the device has gradients of
+    NaN: GaussianAdam skips them, other optimizers do not.
     """
     runs_ahead = state.problem.device.type == "cuda" and isinstance(state.optimizer, GaussianAdam)
     return CudaStepper(state) if runs_ahead else EagerStepper(state)

@@ -18,18 +18,18 @@ from kcgs.optim import move_field, set_rates
 from .graph import StepGraph
 from .readback import Readback
 
-# at the start of a fit, steps that wait, since Gaussians may grow faster than the room for their lists
+# first iterations of a fit, in which the host waits: Gaussians may grow faster than the room for their lists
 _CHECKED_ITERATIONS = 20
-# iterations from one check of divergence to the next: the host is at most twice as many before the device
+# iterations between two checks of divergence: the host is at most twice as many iterations ahead of the device
 _ITERATIONS_PER_CHECK = 10
 
 
 class CudaStepper:
-    """Steps by which the host runs ahead of a GPU; between events they are replayed as a CUDA graph.
+    """Steps in which the host runs ahead of a GPU; between events they are replayed as a CUDA graph.
 
-    A step that the device has no room for has gradients and a render of NaN: GaussianAdam leaves out the former, the
-    history the latter. The step after an event waits, to learn how much room its lists take, and so do the first steps
-    and the one after the host has learned of missing room.
+    A step that finds no room on the device has gradients and a render of NaN. GaussianAdam skips these gradients, the
+    history skips the render. The host waits for the first steps, for the step after an event, and for the step after
+    it has learned of missing room, to learn how much room the lists need.
 
     Args:
         state: of a fit by GaussianAdam.
@@ -65,12 +65,12 @@ class CudaStepper:
         self._last_content, self._lacks_room = self._content(), False
 
     def measure(self, seconds: float) -> None:
-        """See :class:`Stepper`; the first measurement of a fit is waited for."""
+        """See :class:`Stepper`; the host waits for the first measurement of a fit."""
         state = self._state
         with self._running_ahead():
             self._rendered = state.render()
             errors = self._read_back(torch.stack(measure_errors(state.problem, self._rendered)))
-        # of the Gaussians as they are now, since only the errors say whether they are the best
+        # copy the scene now: whether it is the best is known only when the errors arrive
         self._pending.append((snapshot(state, seconds), errors))
         self.poll(wait=not state.history)
 
@@ -85,8 +85,8 @@ class CudaStepper:
     def overflowing_images(self) -> list[int]:
         """See :class:`Stepper`; up to 20 iterations late.
 
-        Every ten iterations the host waits for the numbers of ten iterations before. There it also learns whether a
-        step had no room.
+        Every ten iterations the host waits for the numbers of ten iterations before. They also tell whether a step
+        found no room.
         """
         if self._state.iteration % _ITERATIONS_PER_CHECK:
             return []
@@ -102,37 +102,37 @@ class CudaStepper:
         return (~is_within).nonzero()[:, 0].tolist()
 
     def _make_room(self) -> None:
-        """Wait, and make room for what did not fit."""
+        """Wait for the device, and make room for lists that did not fit."""
         problem = self._state.problem
         settle(problem.device, problem.num_images, problem.size)
 
     def _content(self) -> list[object]:
-        """Return what a step moves and renders with, which events replace."""
+        """Return the objects that a step uses and that events replace."""
         field = self._state.field
         return [field.means, field.cholesky, field.colors, field.region_ids, self._state.renderer]
 
     def _must_wait(self) -> bool:
-        """Whether the next step waits for the device."""
+        """Whether the host must wait for the device before the next step."""
         content, last = self._content(), self._last_content
         return self._lacks_room or len(content) != len(last) or any(map(is_not, content, last))
 
     def _runs_ahead(self) -> bool:
-        """Whether a render need not wait for the device."""
+        """Whether a render may go without waiting for the device."""
         return not self._must_wait() and self._state.iteration >= self._first_iteration + _CHECKED_ITERATIONS
 
     @contextmanager
     def _running_ahead(self) -> Iterator[None]:
-        """Render without waiting, where that is possible, and without a graph that no step needs."""
+        """Render without waiting where possible, and without an autograd graph if the step needs none."""
         with without_waiting() if self._runs_ahead() else nullcontext(), torch.set_grad_enabled(not self._can_replay()):
             yield
 
     def _can_replay(self) -> bool:
-        """Whether the next step is a kernel's programs alone, on a GPU."""
+        """Whether a CUDA graph can replay the next step: fused kernels compute its gradients on a GPU."""
         state = self._state
         return self._runs_ahead() and state.field.means.is_cuda and state.objective.has_fused_gradients(state.renderer)
 
 
 @torch.no_grad()
 def _magnitudes(tables: list[Tensor]) -> Tensor:
-    """Return the largest absolute number of each image's columns, (B, K), of tables; a NaN is the largest."""
+    """Return the largest magnitude in each column of the tables, (B, K), for each image; NaN counts as largest."""
     return torch.cat(tables, -1).abs().amax(1)

@@ -1,4 +1,4 @@
-"""What steps and measures a fit, and the form that waits for each step."""
+"""The protocol of steppers, and the stepper that waits for each step."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ class Stepper(Protocol):
     """Moves and measures the Gaussians of one fit on its device."""
 
     def step(self, rate: float) -> None:
-        """Move the Gaussians once, by a factor of the learning rates, and count the iteration."""
+        """Move the Gaussians once, with `rate` as factor on the learning rates, and count the iteration."""
 
     def measure(self, seconds: float) -> None:
-        """Render and measure the scene, so many seconds after the start; the next step differentiates this render."""
+        """Render and measure the scene, `seconds` after the start; the next step differentiates this render."""
 
     def poll(self, *, wait: bool = False) -> None:
-        """Record the measurements that the device is done with; `wait`: all of them."""
+        """Record the measurements that the device has finished; with `wait`, all measurements."""
 
     def overflowing_images(self) -> list[int]:
         """Return the images that overflow: see :meth:`FitState.overflowing_images`."""
@@ -46,7 +46,7 @@ class EagerStepper:
         record(state, snapshot(state, seconds), measure_errors(state.problem, self._rendered))
 
     def poll(self, *, wait: bool = False) -> None:
-        """See :class:`Stepper`: all measurements are recorded."""
+        """See :class:`Stepper`: `measure` has recorded all measurements."""
 
     def overflowing_images(self) -> list[int]:
         """See :class:`Stepper`."""

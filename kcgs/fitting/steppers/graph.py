@@ -12,10 +12,10 @@ from kcgs.optim import FieldState, move_field
 
 
 class StepGraph:
-    """A gradient and a step of the optimizer, captured at a call, and replayed from then on.
+    """A gradient and a step of the optimizer, captured once and then replayed.
 
-    A capture holds as long as an event replaces no tensor of the fit, nor its cutoff. The first call takes its step
-    without one, since programs are not compiled in a capture.
+    A capture is valid until an event replaces a tensor of the fit or its cutoff. The first call takes its step without
+    a capture, since programs cannot be compiled during one.
     """
 
     def __init__(self) -> None:
@@ -24,11 +24,11 @@ class StepGraph:
         self._rates: list[Tensor] = []
 
     def forget(self) -> None:
-        """Capture anew at the next call."""
+        """Capture again at the next call."""
         self._is_valid = False
 
     def step(self, state: FieldState) -> None:
-        """Take a step, with the learning rates of the moment."""
+        """Take a step with the current learning rates."""
         device, groups, is_first = state.field.means.device, state.optimizer.param_groups, not self._rates
         if is_first:
             self._rates = [torch.empty((), device=device) for _ in groups]
@@ -42,7 +42,7 @@ class StepGraph:
             self._graph.replay()
 
     def _move(self, state: FieldState) -> None:
-        """Take a step that reads the learning rates where a replay finds them."""
+        """Take a step that reads the learning rates from the tensors that a replay reads."""
         groups = state.optimizer.param_groups
         numbers = [group["lr"] for group in groups]
         for group, rate in zip(groups, self._rates, strict=True):
@@ -52,12 +52,12 @@ class StepGraph:
             group["lr"] = number
 
     def record(self, move: Callable[[], None], device: torch.device) -> Any:
-        """Capture a step, in the memory of the previous graph, which is not replayed again."""
+        """Capture a step in the memory of the previous graph; that graph is not replayed again."""
         with torch.cuda.device(device):
             graph, stream, current = torch.cuda.CUDAGraph(), torch.cuda.Stream(), torch.cuda.current_stream()
             stream.wait_stream(current)
             with torch.cuda.stream(stream):
-                # other threads may use the device meanwhile
+                # thread_local: other threads may use the device during the capture
                 graph.capture_begin(None if self._graph is None else self._graph.pool(), "thread_local")
                 try:
                     move()

@@ -1,4 +1,4 @@
-"""Numbers that come from a device while it works on."""
+"""Copies of small tensors to the host while the device works on."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from torch import Tensor
 
 
 class Readback:
-    """A small tensor on its way to the host, where nobody waits for it; one on the CPU is there at once."""
+    """A small tensor on its way to the host, which does not wait; a tensor on the CPU has arrived at once."""
 
     def __init__(self, numbers: Tensor) -> None:
-        # from CUDA into pinned memory, after what the device has to do before
+        # CUDA copies into pinned memory, after the work that the device has queued before
         self._numbers = numbers.detach().to("cpu", non_blocking=numbers.is_cuda)
         self._copied: torch.cuda.Event | None = None
         if numbers.is_cuda:
@@ -19,7 +19,7 @@ class Readback:
                 self._copied.record()
 
     def has_arrived(self) -> bool:
-        """True once `numbers` need not wait."""
+        """True once `numbers` returns without waiting."""
         return self._copied is None or self._copied.query()
 
     def numbers(self) -> Tensor:
