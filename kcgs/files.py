@@ -22,7 +22,7 @@ def save(
     target_bytes: int | None = None,
     target_psnr: float | None = None,
     objective: str | None = None,
-    seed: int = 0,
+    seed: int | None = None,
 ) -> int:
     """Write a scene. The file appears whole or not at all, and the same arguments give the same bytes.
 
@@ -39,7 +39,7 @@ def save(
         target_bytes: the most bytes of the file, in place of `quality`.
         target_psnr: in dB against the image, in place of both.
         objective: l2 or ms-ssim, what is lowered with an image. None: ms-ssim with `target_bytes`, else l2.
-        seed: of the order in which Gaussians are rounded, with an image.
+        seed: of the order in which Gaussians are rounded, with an image. None: 0.
 
     Returns:
         Size of the file in bytes.
@@ -63,7 +63,7 @@ def save(
     """
     path, scene = _check_suffix(Path(path)), check_type(scene)
     goal: dict[str, Any] = {"quality": quality, "target_bytes": target_bytes}
-    refinement: dict[str, Any] = {"target_psnr": target_psnr, "objective": objective}
+    refinement: dict[str, Any] = {"target_psnr": target_psnr, "objective": objective, "seed": seed}
     if path.suffix == ".safetensors":
         _check_none({"image": image, **goal, **refinement}, "for a .safetensors file, which keeps every bit")
         return write_file(path, storage.serialize(scene))
@@ -72,7 +72,7 @@ def save(
         return write_file(path, encode(scene, **goal))
     from kcgs.rate import compress  # which loads all of fitting: 240 ms
 
-    return write_file(path, compress(scene, image, **goal, **refinement, seed=seed).data)
+    return write_file(path, compress(scene, image, **goal, **{**refinement, "seed": seed or 0}).data)
 
 
 def load(path: str | os.PathLike[str]) -> Scene:

@@ -37,7 +37,8 @@ class Sample(NamedTuple):
 def load(name: str, data: str | None = None, quick: bool = False) -> Sample:
     """Read a chart, "disc", a photo of scikit-image, BSDS (a number), Kodak (kodimN), or a sequence's first frame.
 
-    "4 x 6 photos" are those of Kodak in four columns and six rows, "2 x 2 photos 3" four others than "2 x 2 photos 2".
+    "4 x 6 photos" are photos of Kodak in four columns and six rows. "2 x 2 photos 2" begin with the fourth photo,
+    "2 x 2 photos 3" with the seventh.
     The quick form has one of four pixels a side.
     """
     stride = QUICK_STRIDE if quick else 1

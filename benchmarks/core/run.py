@@ -74,12 +74,15 @@ def run_experiment(
     """Measure the jobs without a result, then write results.csv, run.json and report.md.
 
     A job is the keyword arguments of `measure`, a function of a module, which returns rows of JSON's values. The rows
-    are kept in OUTPUT/runs, under a hash of the job, the text of `measure` and the code of kcgs; remove the folder to
-    measure anew. An interruption leaves the results so far: `--redraw` reports them, and the same command goes on.
+    are kept in OUTPUT/runs, under a hash of the job, the text of `measure`, and the code of kcgs and benchmarks/core;
+    remove the folder to measure anew. An interruption leaves the results so far: `--redraw` reports them, and the same
+    command goes on.
     """
     if not options.redraw:
         all_jobs = jobs(options)
-        selection = [job for job in all_jobs if not options.only or job["image"] in options.only]
+        selection = [
+            job for job in all_jobs if not options.only or {job["image"], job.get("comparison")} & {*options.only}
+        ]
         if not selection:
             raise ValueError(f"only must name some of {', '.join({job['image']: 0 for job in all_jobs})}")
         options.output.mkdir(parents=True, exist_ok=True)
@@ -141,9 +144,10 @@ def _path(folder: Path, measure: Measure, job: Job) -> Path:
 
 @cache
 def _sources() -> str:
-    """Hash what kcgs computes with."""
+    """Hash what kcgs and the benchmarks compute with."""
     digest = hashlib.sha256()
-    for path in sorted(Path(kcgs.__file__).parent.rglob("*")):
+    folders = Path(kcgs.__file__).parent, Path(__file__).parent
+    for path in (path for folder in folders for path in sorted(folder.rglob("*"))):
         if path.suffix in (".py", ".toml", ".bin"):
             digest.update(path.read_bytes())
     return digest.hexdigest()

@@ -25,7 +25,7 @@ from .state import FitState
 
 # seconds between two checkpoints, per second that the first of them took to write
 _RUN_PER_WRITE = 100.0
-_VERSION = 11
+_VERSION = 12
 _DIGEST_SIZE = 32  # bytes of the SHA-256 of the content, which begins the file
 
 
@@ -45,7 +45,9 @@ class Checkpoint:
         """Replace the file by the state, and the seconds of the fit so far."""
         start = time.perf_counter()
         buffer = io.BytesIO()
-        torch.save({"problem": _fingerprint(self.problem), "seconds": seconds, **_to_plain(state)}, buffer)
+        torch.save(
+            {"version": _VERSION, "problem": _fingerprint(self.problem), "seconds": seconds, **_to_plain(state)}, buffer
+        )
         content = buffer.getvalue()
         write_file(self.path, hashlib.sha256(content).digest() + content)
         end = time.perf_counter()
@@ -58,6 +60,8 @@ class Checkpoint:
         if hashlib.sha256(content).digest() != digest:
             raise ValueError(f"checkpoint {str(self.path)!r} is damaged, or no checkpoint of a fit")
         plain = torch.load(io.BytesIO(content), self.problem.device, weights_only=True)
+        if plain.get("version") != _VERSION:
+            raise ValueError(f"checkpoint {str(self.path)!r} is of another version of kcgs: remove it, and fit anew")
         if plain["problem"] != _fingerprint(self.problem):
             raise ValueError(
                 f"checkpoint {str(self.path)!r} belongs to another fit: image, regions, settings, num_gaussians and "
@@ -69,7 +73,7 @@ class Checkpoint:
 def _fingerprint(problem: Problem) -> str:
     # a resumed fit may get more time
     settings = problem.config.model_dump_json(exclude={"max_seconds"})
-    numbers = f"{_VERSION} {settings} {problem.num_gaussians} {problem.seed} {tuple(problem.canvas.shape)}"
+    numbers = f"{settings} {problem.num_gaussians} {problem.seed} {tuple(problem.canvas.shape)}"
     digest = hashlib.sha256(numbers.encode())
     digest.update(problem.canvas.cpu().numpy().tobytes())
     if problem.regions is not None:
@@ -88,6 +92,7 @@ def _to_plain(state: FitState) -> dict[str, Any]:
         "anchor": None if state.anchor is None else state.anchor.state(),
         "optimizer": state.optimizer.state_dict(),
         "history": [tuple(entry) for entry in state.history],
+        "contour_seconds": state.contour_seconds,
     }
 
 
@@ -104,6 +109,7 @@ def _from_plain(plain: dict[str, Any], problem: Problem) -> FitState:
         anchor=None if plain["anchor"] is None else RegionMap.from_state(plain["anchor"]),
         history=[HistoryEntry(*entry) for entry in plain["history"]],
         best=None if plain["best"] is None else _best_from_plain(plain["best"], problem.size),
+        contour_seconds=plain["contour_seconds"],
         **plain["numbers"],
     )  # fmt: skip
     state.renderer = state.renderer._replace(cutoff=plain["cutoff"])

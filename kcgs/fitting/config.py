@@ -85,7 +85,7 @@ class FitConfig(BaseModel):
     objective: ObjectiveName | None = Field(
         None,
         description="what is lowered: l2, the squared error; l1; ms-ssim, what MS-SSIM lacks. None: l2, for a file of "
-        "a size or quality ms-ssim. Files and videos take l2 and ms-ssim",
+        "a size ms-ssim. Files and videos take l2 and ms-ssim",
     )
     optimizer: Literal["gaussian-adam", "adan"] = Field(
         "gaussian-adam",

@@ -14,7 +14,7 @@ import onnx_ir.passes.common as passes
 from numpy.typing import NDArray
 from onnx_ir.tape import Tape
 
-OPSET = 18  # what torch exports by default, so that graphs of both chain
+OPSET = 18  # the oldest that has all operators: more runtimes take it, and `onnx.version_converter` raises it
 _IR_VERSION = 10
 
 BOOL = ir.DataType.BOOL

@@ -64,7 +64,8 @@ def compress(
             a target: the value of :func:`quality_for`, so that the file is nearly as good as the scene.
         target_bytes: write the best file of at most this size, in place of `quality`.
         target_psnr: PSNR in dB against the image, in place of both: write the coarsest of a few qualities that reaches
-            it. If the scene itself does not reach it, the file is nearly as good as the scene.
+            it, none coarser than the default of `quality`. If the scene itself does not reach it, the file is nearly
+            as good as the scene.
         iterations: renders that descent and rounding may take, at least 1.
         seed: of the order in which Gaussians are rounded.
         objective: of the descent, l2 or ms-ssim, as in :class:`kcgs.FitConfig`. None: ms-ssim with `target_bytes`,
@@ -218,8 +219,9 @@ class Compressor:
 
     def search_psnr(self, target_psnr: float, scene_psnr: float) -> bytes:
         """Return the coarsest file that reaches `target_psnr`; if the scene does not reach it, the coarsest of all."""
-        for step in _QUALITY_STEPS if scene_psnr >= target_psnr else _QUALITY_STEPS[:1]:
-            data = self.write(self.writer.qp_for(quality_for(scene_psnr + step)))
+        steps = _QUALITY_STEPS if scene_psnr >= target_psnr else _QUALITY_STEPS[:1]
+        for quality in dict.fromkeys(quality_for(scene_psnr + step) for step in steps):
+            data = self.write(self.writer.qp_for(quality))
             if float(psnr(decode(data).scene.render(), self.objective.image)) >= target_psnr:
                 break
         return data

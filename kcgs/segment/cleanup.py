@@ -97,7 +97,7 @@ class Cleanup:
         pixels = check_segment_image(image)
         labels, scores, names = labels if isinstance(labels, Prediction) else Prediction(labels)
         classes = check_labels("labels", labels, dims=(2,)).cpu()
-        scores = None if scores is None else torch.as_tensor(scores).double().cpu()
+        scores = None if scores is None else torch.as_tensor(scores).detach().double().cpu()
         for name, values in (("labels", classes), ("scores", scores)):
             if values is not None and values.shape != pixels.shape[1:]:
                 raise ValueError(

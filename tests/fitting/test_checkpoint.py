@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
 import random
 from pathlib import Path
 
 import pytest
+import torch
 
-from kcgs import fit
-from kcgs.fitting import FitResult
+from kcgs import FitConfig, fit
+from kcgs.fitting import FitResult, make_problem
+from kcgs.fitting.checkpoint import Checkpoint
+from kcgs.fitting.start import start
 
 from .textures import quick, same, scene
 
@@ -64,6 +69,23 @@ class TestCheckpoint:
             with pytest.raises(ValueError, match="belongs to another fit"):
                 fit(regions=labels, checkpoint=file, resume=True, **arguments)  # type: ignore[arg-type]
         assert file.read_bytes() == before
+
+    def test_keeps_what_contours_took_of_the_clock(self, tmp_path: Path) -> None:
+        image, labels = scene()
+        problem = make_problem(image, labels, 30, FitConfig(max_seconds=9.0), 0)
+        state, store = start(problem), Checkpoint(tmp_path / "state", problem)
+        state.contour_seconds = [0.5, 0.25]
+        store.write(state, 2.0)
+        resumed, seconds = store.read()
+        assert resumed.contour_seconds == [0.5, 0.25] and seconds == 2.0
+
+    def test_another_version_is_refused(self, tmp_path: Path) -> None:
+        path = tmp_path / "fit.ckpt"
+        content = io.BytesIO()
+        torch.save({"problem": "", "seconds": 1.0}, content)
+        path.write_bytes(hashlib.sha256(content.getvalue()).digest() + content.getvalue())
+        with pytest.raises(ValueError, match="is of another version of kcgs: remove it, and fit anew"):
+            fit(torch.rand(3, 8, 9), num_gaussians=4, checkpoint=path, resume=True)
 
     def test_damaged_is_refused(self, tmp_path: Path) -> None:
         image, labels = scene()

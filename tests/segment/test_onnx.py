@@ -39,11 +39,11 @@ def write_model(path: Path, nodes: list[Any], shape: list[Any], rank: int, kind:
 def write_mixer(path: Path, weights: list[list[float]], tail: str = "", size: tuple[Any, Any] = ("h", "w")) -> Path:
     """Write a 1 x 1 convolution of the three channels, and perhaps one operator more."""
     weight = numpy_helper.from_array(np.array(weights, dtype=np.float32)[:, :, None, None], "weight")
-    options = {"ArgMax": {"axis": 1, "keepdims": 0}, "Softmax": {"axis": 1}}
+    options = {"ArgMax": {"axis": 1, "keepdims": 0}, "Softmax": {"axis": 1}, "Cast": {"to": TensorProto.INT64}}
     nodes = [helper.make_node("Conv", ["image", "weight"], ["mixed" if tail else "out"])]
     if tail:
         nodes.append(helper.make_node(tail, ["mixed"], ["out"], **options[tail]))
-    rank, kind = (3, TensorProto.INT64) if tail == "ArgMax" else (4, TensorProto.FLOAT)
+    rank, kind = 4 - (tail == "ArgMax"), TensorProto.INT64 if tail in ("ArgMax", "Cast") else TensorProto.FLOAT
     return write_model(path, nodes, [1, 3, *size], rank, kind, [weight])
 
 
@@ -90,6 +90,7 @@ class TestOnnx:
         [
             ("", {"names": COLORS[:2]}, "names must be 3, one for each class, class 0 first; got 2"),
             ("ArgMax", {"names": COLORS[:2]}, "names must have one for label 2; got 2 names"),
+            ("Cast", {}, "model must be a network of labels in one channel, or of floating scores; got 3 channels"),
             ("", {"threshold": 2.0}, "threshold must be in"),
             ("", {"mean": (0.0,)}, "mean must be 3 numbers"),
             ("", {"mean": "half"}, "mean must be 3 numbers"),

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs._check import check_floating, check_number, check_numbers, check_size
+from kcgs.errors import InvalidArgument
 from kcgs.segment.cleanup import Prediction
 from kcgs.segment.networks import IMAGENET_MEAN, IMAGENET_STD, library_errors, predict_labels, preprocess
 from kcgs.segment.registry import register
@@ -63,6 +64,9 @@ def onnx(
     check_number("threshold", threshold, 0, 1)
     raw = _run(image, model, size, mean, std)
     if not raw.is_floating_point():
+        if len(raw) > 1:
+            received = f"{len(raw)} channels of {raw.dtype}"
+            raise InvalidArgument("model", "a network of labels in one channel, or of floating scores", received)
         labels = F.interpolate(raw[None].double(), image.shape[1:], mode="nearest-exact")[0, 0].long()
         return Prediction(labels, names=names)
     if len(raw) > 1:

@@ -12,6 +12,9 @@ from kcgs.segment.cleanup import Prediction
 from kcgs.segment.networks import library_errors, load_pretrained, predict_labels, preprocess
 from kcgs.segment.registry import register
 
+# sides in pixels of the images that CLIPSeg's decoder is trained on
+_SIDE = 352
+
 
 @register("text")
 def text(
@@ -52,8 +55,7 @@ def text(
 
         tokenizer = AutoTokenizer.from_pretrained(network.name_or_path)
         tokens = tokenizer(list(prompts), padding=True, truncation=True, return_tensors="pt").to(image.device)
-    side = network.config.vision_config.image_size
-    shown = preprocess(image, (side, side)).expand(len(prompts), -1, -1, -1)
+    shown = preprocess(image, (_SIDE, _SIDE)).expand(len(prompts), -1, -1, -1)
     with torch.no_grad():
         logits = network(
             pixel_values=shown, input_ids=tokens["input_ids"], attention_mask=tokens["attention_mask"]
