@@ -7,7 +7,7 @@ from .render import render_over, render_region
 from .scenes import delete_region, extract_region, move_region, replace_background
 from .selection import members_of, unique_region_ids, warn_of_lost_regions
 
-# public; what else is imported here is for the other rooms of kcgs
+# the public names; other packages of kcgs use the other imports
 __all__ = [
     "delete_region",
     "extract_region",

@@ -1,4 +1,4 @@
-"""Gaussians for the hole that an edit leaves, fitted to copies of other places."""
+"""Fill the hole that an edit leaves: fit Gaussians to copies of other parts of the image."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ from kcgs.scene import Scene
 from .inpainting import inpaint_from_matches
 from .masks import dilate
 
-# pixels around a region that may have colours of it, as edges in photos are blurred and masks are not exact
+# pixels around a region that may have its colours, since edges in photos are blurred and masks are not exact
 MARGIN = 6
-# half the width of gaps between such pixels that are filled, too
+# half the width, in pixels, of gaps that are filled too
 _CLOSING = 8
 # Gaussians with a larger share of their weight in the hole are fitted; a higher threshold leaves traces of the object
 _FITTED_SHARE = 0.05
-# those with a larger share are removed: fitted, they become dots
+# Gaussians with a larger share of their weight in the hole are removed: if they were fitted, they would become dots
 _REMOVED_SHARE = 0.8
-# Gaussians that are added per pixel of a hole, where the scene around it has one
+# Gaussians per pixel that are added in a hole, as a multiple of the density around it
 _DENSITY = 2.0
-# least number of them
+# least number of added Gaussians
 _LEAST_ADDED = 16
-# their standard deviation, in the distance between them
+# standard deviation of added Gaussians, in their spacing
 _SIGMA = 0.6
 _STEPS = 120
 _CUTOFF = 1e-4
-# learning rates; with larger ones Gaussians that are alike swing, and the hole shows ripples
+# learning rates; with larger rates similar Gaussians oscillate, and the hole shows ripples
 _RATE = 0.07
 _COLOR_RATE = 0.015
 
@@ -54,13 +54,13 @@ def fill_hole(scene: Scene, hole: Tensor, visible: Tensor, margin: int) -> Scene
 
     Args:
         scene: with a map that covers the hole.
-        hole: where regions were, :math:`(H, W)` bool.
+        hole: pixels of the removed regions, :math:`(H, W)` bool.
         visible: the part of the hole to fill, of the same shape.
-        margin: pixels around it that are filled, too.
+        margin: width of the rim around it that is filled too, in pixels.
 
     Returns:
-        The scene without the Gaussians of the hole. Gaussians that reach into the hole are fitted to what is around
-        it, together with new ones.
+        The scene without the Gaussians inside the hole. Gaussians that reach into the hole are fitted to its
+        surroundings, together with new Gaussians.
     """
     regions = scene.regions
     assert regions is not None
@@ -81,8 +81,8 @@ def fill_hole(scene: Scene, hole: Tensor, visible: Tensor, margin: int) -> Scene
 
 
 def _fringe(mask: Tensor, labels: Tensor, width: int) -> Tensor:
-    """Return the pixels near a mask and in its gaps, (H, W) bool, of the regions in it that go on farther away."""
-    # with a margin, since gaps between the mask and the border of the image stay
+    """Return the pixels near a mask and in its gaps, (H, W) bool, of regions that extend from the mask farther out."""
+    # padding: gaps between the mask and the border of the image are not filled
     margin = width + _CLOSING
     wide = dilate(pad(mask, (margin,) * 4), margin)
     near = ~dilate(~wide, _CLOSING)[margin:-margin, margin:-margin]
@@ -96,7 +96,7 @@ def _share_in(field: GaussianField, regions: RegionMap, hole: Tensor) -> Tensor:
 
 
 def _spread(residual: Tensor, mask: Tensor, regions: RegionMap, density: float) -> GaussianField:
-    """Spread round Gaussians over a mask, whose sum is about the residual there."""
+    """Spread round Gaussians over a mask so that their render is about the residual."""
     spacing = max(1.0, max(density, _LEAST_ADDED / float(mask.sum())) ** -0.5)
     rows, cols = (torch.arange(min(spacing, n) / 2, n, spacing, device=mask.device).long() for n in mask.shape)
     grid = torch.zeros_like(mask)
@@ -112,7 +112,7 @@ def _spread(residual: Tensor, mask: Tensor, regions: RegionMap, density: float) 
 def _fit(field: GaussianField, regions: RegionMap, target: Tensor, weight: Tensor) -> GaussianField:
     """Fit Gaussians to a target, with a weight per pixel; opacities are merged into the colours."""
     field = Gaussians.of(field).field(field.size)
-    # tensors, so that the schedule, too, is in the precision of the field
+    # tensors, so that the schedule also has the precision of the field
     rate, color_rate = field.means.detach().new_tensor([_RATE, _COLOR_RATE])
     optimizer = GaussianAdam(field, rate, color_lr=color_rate)
     renderer = Renderer(field.size, regions, _CUTOFF)

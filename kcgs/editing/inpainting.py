@@ -1,4 +1,4 @@
-"""Unknown pixels of an image, as means of what is around them or copies of other places."""
+"""Inpainting: unknown pixels become a smooth continuation of their surroundings, or copies of other places."""
 
 from __future__ import annotations
 
@@ -15,36 +15,36 @@ from .montage import choose_layers
 
 Window = tuple[slice, slice]
 
-# reduced pixels of a hole, and of the hole and its surroundings, at most: larger ones are reduced
+# most pixels of a hole, and of a hole with its surroundings: larger ones are reduced in size
 _MAX_PIXELS = 2_000
 _MAX_SURROUNDINGS = 40_000
-# extents of a hole from which places are copied, on each side of it
+# width of the surroundings from which places are copied, on each side, in extents of the hole
 _SURROUNDINGS = 2
-# pixels between two parts of a hole that are filled together
+# largest distance between two parts of a hole that are filled together, in pixels
 _GAP = 16
-# half the side of the patches by which an image repeats itself, in reduced pixels
+# half the side of patches that are compared, in reduced pixels
 _HALF_PATCH = 3
-# patches that are compared with all others, and of them at a time
+# number of patches that are compared with all others, and their number per batch
 _PATCHES = 1_500
 _CHUNK = 100
-# offsets by which patches repeat that are tried
+# number of offsets between similar patches that are tried
 _REPETITIONS = 60
-# of a hole and what is around it: offsets of a smaller share of its longer side do not count as repetitions
+# least offset between similar patches, as a share of the longer side of the hole with its surroundings
 _LEAST_OFFSET = 1 / 15
-# cost of a pixel that continues its surroundings smoothly, where seams cost the difference of their sides
+# cost of a pixel that continues its surroundings smoothly; a seam costs the difference of its two sides
 _SMOOTH_COST = 0.1
-# cost of a pixel without a copy, as its place is unknown or beyond the image
+# cost of a pixel whose copy would come from an unknown place or from outside the image
 _UNKNOWN_COST = 50.0
-# weight of the difference of a copy and the smooth continuation: conspicuous things are not copied
+# weight of the difference between a copy and the smooth continuation: conspicuous things are not copied
 _SMOOTH_WEIGHT = 0.02
 # reduced pixels over which copies of two places are blended
 _BLEND = 1
-# largest difference of image and copy that is continued; with more, an edge that only one of them has tints the hole
+# largest difference between image and copy that is continued; if larger, an edge in only one of them tints the hole
 _LARGEST_DIFFERENCE = 0.1
 
 
 def inpaint(image: Tensor, unknown: Tensor) -> Tensor:
-    """Continue an image (C, H, W) smoothly into its unknown pixels, (H, W) bool; one pixel at least is known.
+    """Continue an image (C, H, W) smoothly into its unknown pixels, (H, W) bool; at least one pixel is known.
 
     Source: Gortler, Grzeszczuk, Szeliski and Cohen, "The Lumigraph", 1996: pull and push.
     """
@@ -52,11 +52,11 @@ def inpaint(image: Tensor, unknown: Tensor) -> Tensor:
 
 
 def inpaint_from_matches(image: Tensor, unknown: Tensor) -> Tensor:
-    """Copy other places of the image into unknown pixels, so that seams are seen least.
+    """Copy other places of the image into unknown pixels, with the least visible seams.
 
-    The places lie at offsets by which the image repeats itself around a hole, or beside the hole. Copies are shifted by
-    a smooth continuation of the difference around them. Where no copy fits, pixels continue their surroundings
-    smoothly, as `inpaint` does. Parts of the hole that are apart are filled one by one.
+    The copied places are at offsets between similar patches around the hole, or beside the hole. The differences
+    between image and copies around the hole are continued smoothly into it and added. Where no copy fits, pixels
+    continue their surroundings smoothly, as `inpaint` does. Separate parts of the hole are filled one by one.
 
     Source: He and Sun, "Statistics of patch offsets for image completion", 2012.
     """
@@ -69,7 +69,7 @@ def inpaint_from_matches(image: Tensor, unknown: Tensor) -> Tensor:
 
 
 def _parts(unknown: Tensor) -> Iterator[tuple[Window, Tensor]]:
-    """Yield the surroundings of each part of a hole, and which of its pixels are of the part."""
+    """Yield, for each part of a hole, the window of its surroundings and the mask of the part in this window."""
     from scipy import ndimage
 
     labels, count = ndimage.label(dilate(unknown, _GAP // 2).cpu().numpy())
@@ -83,14 +83,14 @@ def _parts(unknown: Tensor) -> Iterator[tuple[Window, Tensor]]:
 
 
 def _surroundings(places: Tensor, size: int) -> slice:
-    """Return the rows or columns of a hole, and those around it."""
+    """Return the range of rows or columns of a hole with its surroundings."""
     low, high = int(places.min()), int(places.max()) + 1
     margin = _SURROUNDINGS * (high - low)
     return slice(max(0, low - margin), min(size, high + margin))
 
 
 def _copies(image: Tensor, window: Window, unknown: Tensor, part: Tensor) -> Tensor:
-    """Return a window of a smoothly continued image (C, H, W), with copies in a part of its unknown pixels."""
+    """Return a window of a smoothly continued image (C, H, W); `part` of its unknown pixels has copies."""
     height, width = part.shape
     area = max(float(part.sum()) / _MAX_PIXELS, part.numel() / _MAX_SURROUNDINGS)
     reduction = max(1, round(math.sqrt(area)))
@@ -115,7 +115,7 @@ def _copies(image: Tensor, window: Window, unknown: Tensor, part: Tensor) -> Ten
 
 
 def _shifted(image: Tensor, window: Window, offset: tuple[int, int]) -> Tensor:
-    """Return what is at an offset (rows, columns) from each pixel of a window; beyond the image, its border."""
+    """Return the pixel at an offset (rows, columns) from each pixel of a window; outside the image, the border."""
     rows, columns = (
         torch.arange(part.start + step, part.stop + step, device=image.device).clamp(0, size - 1)
         for part, step, size in zip(window, offset, image.shape[1:], strict=True)
@@ -124,20 +124,20 @@ def _shifted(image: Tensor, window: Window, offset: tuple[int, int]) -> Tensor:
 
 
 def _has_source(hole: Tensor, offset: tuple[int, int]) -> Tensor:
-    """Return which pixels have a known one at an offset, (H, W) bool."""
+    """Return True where the pixel at an offset is known, (H, W) bool."""
     inside = pad(~hole, (-min(offset[1], 0), max(offset[1], 0), -min(offset[0], 0), max(offset[0], 0)))
     return inside[max(offset[0], 0) :, max(offset[1], 0) :][: hole.shape[0], : hole.shape[1]]
 
 
 def _offsets(image: Tensor, hole: Tensor, part: Tensor) -> list[tuple[int, int]]:
-    """Return offsets (rows, columns) of places to copy: repetitions of the image, and the eight beside a part."""
+    """Return offsets (rows, columns) of places to copy: between similar patches, and the eight beside a part."""
     rows, columns = (int(places.max() - places.min()) + 1 for places in part.nonzero().T)
     beside = {(rows * down, columns * right) for down, right in product((-1, 0, 1), repeat=2)} - {(0, 0)}
     return sorted({*_repetitions(image, hole), *beside})
 
 
 def _repetitions(image: Tensor, hole: Tensor) -> list[tuple[int, int]]:
-    """Return the offsets (rows, columns) from most patches outside a hole to those that look most like them."""
+    """Return the most frequent offsets (rows, columns) from patches outside a hole to their most similar patches."""
     (height, width), side = hole.shape, 2 * _HALF_PATCH + 1
     if min(height, width) <= side:
         return []
@@ -164,7 +164,7 @@ def _repetitions(image: Tensor, hole: Tensor) -> list[tuple[int, int]]:
 
 
 def _pull_push(image: Tensor, weight: Tensor) -> Tensor:
-    """Fill where the weight (1, H, W) is below 1 from the image at half the size, filled in the same way."""
+    """Fill pixels of a weight (1, H, W) below 1 from the image at half its size, which is filled in the same way."""
     height, width = weight.shape[1:]
     if height * width == 1:
         return image

@@ -1,4 +1,4 @@
-"""Masks and label maps, pixel by pixel."""
+"""Dilate masks, shift label maps, and check offsets."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from torch.nn.functional import max_pool2d, pad
 from kcgs._check import check_number
 from kcgs.errors import InvalidArgument, InvalidArgumentType
 
-# pixels; a larger offset is an error of the caller's
+# largest offset in pixels; a larger one is surely an error
 _LARGEST_OFFSET = 1e8
-# pixels by which an offset may miss a whole number
+# largest distance of an offset from a whole number, in pixels
 _OFFSET_TOLERANCE = 1e-6
 
 
@@ -25,14 +25,14 @@ def dilate(mask: Tensor, reach: int) -> Tensor:
 
 
 def shift_labels(labels: Tensor, mask: Tensor, offset: tuple[int, int], background: Tensor) -> tuple[Tensor, Tensor]:
-    """Move the labels of a mask over those of a background, (..., H, W); return the mask, moved, and all labels."""
+    """Move the labels of a mask over background labels, (..., H, W); return the moved mask and the new labels."""
     dx, dy = (max(-length, min(step, length)) for length, step in zip(labels.shape[:-3:-1], offset, strict=True))
     landing = pad(mask, (dx, -dx, dy, -dy))
     return landing, torch.where(landing, labels.roll((dy, dx), (-2, -1)), background)
 
 
 def check_offset(offset: Sequence[float]) -> tuple[int, int]:
-    """Return an offset (dx, dy) in whole pixels."""
+    """Validate an offset (dx, dy), and return it in whole pixels."""
     pair = offset.tolist() if isinstance(offset, Tensor | np.ndarray) else offset
     if not isinstance(pair, Sequence) or isinstance(pair, str):
         raise InvalidArgumentType("offset", "(dx, dy) in pixels", repr(offset))

@@ -1,4 +1,4 @@
-"""A choice of one layer per pixel whose seams are seen least: alpha expansion by graph cuts."""
+"""Choose one layer per pixel with the least visible seams: alpha expansion by graph cuts."""
 
 from __future__ import annotations
 
@@ -7,25 +7,25 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-# costs are rounded to this, as the flow is one of integers
+# costs are rounded to multiples of this, since the flow takes integers
 _RESOLUTION = 1e-4
 # largest cost of a pixel
 _LIMIT = 1e4
 
 
 def choose_layers(layers: Tensor, costs: Tensor, unknown: Tensor) -> Tensor:
-    """Choose a layer for each unknown pixel, so that seams between layers and at the border of the hole are seen least.
+    """Choose a layer for each unknown pixel, with the least visible seams between layers and around the hole.
 
-    Two neighbours with different layers cost the difference of these layers at both pixels. A pixel beside a known one
-    costs the difference of its layer and the image at the known pixel. Each step gives one layer to the pixels where
-    this lowers the sum most: first each layer in turn, then those in use again.
+    Two neighbours with different layers cost the difference of these layers at both pixels. A pixel beside a known
+    pixel costs the difference of its layer and the image at the known pixel. Each step gives one layer to the pixels
+    where this lowers the total cost most: first each layer in turn, then each layer in use again.
 
     Source: Boykov, Veksler and Zabih, "Fast approximate energy minimization via graph cuts", 2001, for the steps;
     Agarwala et al., "Interactive digital photomontage", 2004, for seams.
 
     Args:
-        layers: :math:`(L, C, H, W)`; the first one is the image where it is known.
-        costs: :math:`(L, H, W)`, of a layer at a pixel, at least 0.
+        layers: :math:`(L, C, H, W)`; the first layer is the image where it is known.
+        costs: cost of each layer at each pixel, :math:`(L, H, W)`, at least 0.
         unknown: :math:`(H, W)` bool.
 
     Returns:
@@ -68,20 +68,20 @@ class _Seams:
         self.pairs = torch.cat(pairs, 1)
 
     def energy(self, labels: Tensor) -> float:
-        """Return the cost of a choice."""
+        """Return the total cost of a choice of layers."""
         first, second = self.pairs
         seams = self._difference(labels[first], labels[second])
         return float(self.costs.gather(0, labels[None]).sum() + seams.sum())
 
     def expand(self, labels: Tensor, layer: int) -> Tensor:
-        """Return the pixels that take a layer, so that the cost is the least of all such choices."""
+        """Return the mask of the pixels that should change to `layer`: no other such mask has less total cost."""
         first, second = self.pairs
         kept = self._difference(labels[first], labels[second])
         second_changes = self._difference(labels[first], torch.full_like(first, layer))
         first_changes = self._difference(torch.full_like(first, layer), labels[second])
         gain = self.costs[layer] - self.costs.gather(0, labels[None])[0]
-        # with 1 for a change of the first, x, and of the second, y: kept + (first - kept) x - first y
-        # + (first + second - kept) (1 - x) y
+        # x and y are 1 if the first and the second pixel of a pair change; the pair then costs
+        # kept + (first - kept) x - first y + (first + second - kept) (1 - x) y
         gain = gain.index_add(0, first, first_changes - kept).index_add(0, second, -first_changes)
         return _cut(gain, self.pairs, (first_changes + second_changes - kept).clamp_min(0))
 

@@ -1,4 +1,4 @@
-"""Other colours for regions: each edit returns a new scene."""
+"""Change the colours of regions: each edit returns a new scene."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from .selection import members_of, unique_region_ids
 
 Numbers = Tensor | NDArray[Any] | Sequence[Any] | float
 
-# standard deviation of a flat Gaussian, in longer sides of the image: its values differ by 3 in 10^7 at most
+# standard deviation of a flat Gaussian, in longer sides of the image: its values differ by at most 3 in 10^7
 _FLAT_SIGMA = 1e3
-# share of a new colour in a recoloured region, by default: pale objects keep something of what they were
+# default share of a new colour in a recoloured region: pale objects keep some of their old colour
 _STRENGTH = 0.75
-# share of a region's pixels that are no brighter than those that get its new colour
+# quantile of a region's luma that gets exactly the new colour
 _BRIGHT_SHARE = 0.9
-# share of them that stay within [0, 1]: glints beyond may clip
+# quantile of a region's luma that stays within [0, 1]: brighter glints may clip
 _UNCLIPPED_SHARE = 0.995
-# least share of the new colour that the former get, so that the latter stay
+# least factor of the new colour at the quantile `_BRIGHT_SHARE`, if the region must get darker to stay within [0, 1]
 _LEAST_COLOR = 0.75
-# their luma, at least, for contrast: in darker regions noise would be seen
+# least luma at this quantile in the computation of contrast: in darker regions noise would be visible
 _MIN_LUMA = 0.25
 
 
@@ -46,19 +46,19 @@ def recolor_region(
 ) -> Scene:
     r"""Change the colours of regions in the image to c' = gain c + bias, or give them another colour.
 
-    Convention: a gain acts on the colours of the Gaussians. A bias is one more Gaussian per region, flat over the whole
-    image, for pixels are sums of Gaussians, not means. A `color` is that of the brightest tenth of a region, and keeps
-    its shading: it is multiplied by the luma of each pixel over the luma there. Where brighter pixels would pass 1, the
-    region is darker, the brightest tenth by a quarter at most: then the contrast is less. Regions whose brightest tenth
-    is below a quarter get the contrast of one where it is a quarter.
+    Convention: a gain acts on the colours of the Gaussians. A bias adds one Gaussian per region, flat over the whole
+    image, since pixels are sums of Gaussians, not means. A `color` keeps the region's shading: it is multiplied by the
+    luma of each pixel, divided by the luma at which the brightest tenth of the region begins. If brighter pixels would
+    pass 1, the region gets darker, there by at most a quarter; beyond that the contrast is reduced. If that luma is
+    below 0.25, it counts as 0.25 for the contrast.
 
     Args:
-        scene: with region ids; of a batch, all images. With `color` it needs a map.
-        region_ids: an id of some of its Gaussians, or several.
-        gain: a number, one for each channel :math:`(C)`, or a matrix :math:`(C, C)`: tensors, arrays or lists.
-        bias: a number, or one for each channel :math:`(C)`; None: no Gaussian is added.
+        scene: with region ids; in a batch all images change. With `color` it needs a map.
+        region_ids: an id of some of its Gaussians, or several ids.
+        gain: a number, a number for each channel :math:`(C)`, or a matrix :math:`(C, C)`: tensors, arrays or lists.
+        bias: a number, or a number for each channel :math:`(C)`; None: no Gaussian is added.
         color: in place of gain and bias, a name such as "red" or "#ff0000", or a number for each channel :math:`(C)`.
-        strength: share of the new colour, in [0, 1]; the rest is the old one. Not read without `color`.
+        strength: share of the new colour, in [0, 1]; the rest is the old colour. Ignored without `color`.
 
     Returns:
         A new scene, without a graph.
@@ -106,7 +106,7 @@ def _recolor(scene: Scene, ids: list[int], gain: Numbers, bias: Numbers | None) 
 
 
 def _paint(scene: Scene, region_id: int, color: str | Numbers, strength: float) -> Scene:
-    """Give a region a share of a colour: the colour times a linear function of the luma, 1 in the brightest tenth."""
+    """Give a region a share of a colour times a linear function of the luma; see `recolor_region`."""
     if scene.regions is None:
         raise InvalidArgument("scene", "a label map", "none", verb="have")
     pixels = scene.regions.labels == region_id
@@ -133,7 +133,7 @@ def _paint(scene: Scene, region_id: int, color: str | Numbers, strength: float) 
 
 
 def _named_color(color: str | Numbers) -> Numbers:
-    """Return the numbers of a colour's name, in RGB."""
+    """Return the RGB values of a colour's name."""
     if not isinstance(color, str):
         return color
     from PIL import ImageColor
@@ -145,7 +145,7 @@ def _named_color(color: str | Numbers) -> Numbers:
 
 
 def _color_tensor(name: str, value: Numbers, colors: Tensor, shapes: list[tuple[int, ...]]) -> Tensor:
-    """Return numbers of one of the shapes in the dtype and on the device of the colours."""
+    """Return numbers as a tensor of one of `shapes`, with the dtype and device of the colours."""
     if isinstance(value, Sequence | np.ndarray) and not isinstance(value, str):
         try:
             value = torch.as_tensor(value, dtype=colors.dtype)
@@ -159,7 +159,7 @@ def _color_tensor(name: str, value: Numbers, colors: Tensor, shapes: list[tuple[
 
 
 def _flat_gaussian(field: GaussianField, region_id: int, color: Tensor) -> GaussianField:
-    """Return one Gaussian of a colour that is the same all over the image, or all images of a batch."""
+    """Return one Gaussian with the same colour over the whole image, or over all images of a batch."""
     height, width = field.size
     sigma = _FLAT_SIGMA * max(height, width)
     lead = (*field.means.shape[:-2], 1)

@@ -1,4 +1,4 @@
-"""Renders of some regions alone, and of a scene over another image."""
+"""Render some regions alone, or a scene over another image."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ def render_region(
 ) -> Tensor:
     r"""Render regions alone, with their membership of each pixel as alpha.
 
-    Convention: colours are straight, not multiplied by alpha: under a soft contour, too, they are what the regions
-    paint where they have the pixel to themselves. They are 0 where alpha is. Without `clamp`, the sum of alpha times
-    colour over all regions is the image. Differentiable, as the renderer is.
+    Convention: colours are not multiplied by alpha: also under a soft contour they are the colours that the regions
+    would have there without other regions. They are 0 where alpha is 0. Without `clamp`, the sum of alpha times colour
+    over all regions is the image. Differentiable, like the renderer.
 
     Args:
         scene: unbatched, with a map.
@@ -52,7 +52,7 @@ def render_region(
     colors = field.colors.new_zeros(field.colors.shape[-1], *render_size)
     gaussians = *scaled_gaussians(field, render_size), field.merged_colors()
     for region, membership in memberships.items():
-        # rendered without the map, which gives the colour itself: nothing is divided by a small alpha
+        # a render without the map gives the colour itself: no division by a small alpha
         rows = field.region_ids == region
         region_image = region_splat(*(t[rows] for t in gaussians), size=render_size)
         share = (membership / torch.where(total > 0, total, 1.0)).to(region_image.dtype)
@@ -64,15 +64,15 @@ def render_region(
 
 
 def render_over(scene: Scene, region_ids: int | Iterable[int], image: Tensor) -> Tensor:
-    r"""Render the scene with an image in place of some regions, at the size of that image.
+    r"""Render the scene with an image in place of some regions, at the size of this image.
 
-    Convention: the image gets the membership that those regions had, so that soft contours blend with it as they did
-    with them. Not clipped. Differentiable in the scene and in the image.
+    Convention: the image gets the membership of the replaced regions, so that soft contours blend with it as they did
+    with the regions. The result is not clipped. It is differentiable in the scene and in the image.
 
     Args:
         scene: unbatched, with a map.
         region_ids: the regions that the image replaces: an id in the map, or several.
-        image: :math:`(C, H, W)`, as many channels as the scene has; any size.
+        image: :math:`(C, H, W)`, with the scene's number of channels and any size.
 
     Returns:
         Image, :math:`(C, H, W)`.

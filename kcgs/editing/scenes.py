@@ -1,4 +1,4 @@
-"""Move, delete and extract regions, and put other scenes behind them: each edit returns a new scene."""
+"""Move, delete and extract regions, or replace the background: each edit returns a new scene."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .fill import MARGIN, fill_hole
 from .masks import check_offset, dilate, shift_labels
 from .selection import members_of, select_regions, select_removable_regions, warn_of_lost_regions
 
-# standard deviations of a soft contour beyond which it is taken as 0 or 1
+# distance from a soft contour, in its standard deviations, beyond which memberships count as 0 or 1
 _CONTOUR_SIGMAS = 4.0
 
 
@@ -29,22 +29,22 @@ def move_region(
     fill: bool = True,
     margin: int = MARGIN,
 ) -> Scene:
-    """Move regions: their Gaussians and their labels, over what lies there.
+    """Move the Gaussians and labels of regions, over the regions at their new place.
 
     Convention: pixels that the regions leave take the label of the nearest pixel of another region. Pixels that leave
-    the image are lost. A region that is covered whole, or leaves the image, is lost with its Gaussians. Where the
-    softness differs by pairs of regions, a new contour has their mean. :func:`kcgs.video.move_in_video` moves them in
-    all frames of a video, and always fills what they leave.
+    the image are lost. A region that is fully covered, or leaves the image, is lost with its Gaussians. If pairs of
+    regions differ in softness, a new contour has their mean softness. :func:`kcgs.video.move_in_video` moves regions in
+    all frames of a video, and always fills the pixels that they leave.
 
     Args:
         scene: unbatched, with a map of its own size, not a resized one.
         region_ids: an id in the map, or several, which move together.
-        offset: (dx, dy) in pixels, whole.
-        fill: True: the uncovered pixels continue their surroundings with copies of other places, by Gaussians that are
-            fitted there, some of them new; pixels beyond the margin change by a few hundredths. False: the uncovered
-            pixels show what the Gaussians of their new region paint there, streaks or black.
-        margin: pixels around the uncovered ones that are filled, too, at least 0: they have colours of the object, as
-            contours are soft and masks are not exact.
+        offset: (dx, dy) in whole pixels.
+        fill: True: uncovered pixels continue their surroundings with copies of other places; old and new Gaussians are
+            fitted to these copies, and values beyond the margin change by a few hundredths. False: uncovered pixels
+            show the Gaussians of their new region as they are: streaks or black.
+        margin: pixels around the uncovered pixels that are filled too, at least 0: they have colours of the object,
+            since contours are soft and masks are not exact.
 
     Returns:
         A new scene, without a graph.
@@ -83,7 +83,7 @@ def move_region(
 
 
 def _contour_reach(regions: RegionMap) -> int:
-    """Return the distance from a contour, in pixels, within which one sees what is behind a region."""
+    """Return the distance from a contour, in pixels, within which the background of a region is visible."""
     softness = _softness_of_one(regions)
     largest = softness if isinstance(softness, float) else max(softness.values(), default=0.0)
     return math.ceil(1.0 + _CONTOUR_SIGMAS * largest)
@@ -92,10 +92,10 @@ def _contour_reach(regions: RegionMap) -> int:
 def delete_region(scene: Scene, region_ids: int | Iterable[int], *, fill: bool = True, margin: int = MARGIN) -> Scene:
     """Delete regions with their Gaussians; their neighbours take over their pixels.
 
-    Convention: each pixel takes the label of the nearest pixel of another region, and is filled. Arguments and errors
-    are those of :func:`move_region`. Where the softness differs by pairs of regions, a new contour has their mean.
-    :func:`kcgs.video.delete_from_video` deletes them from all frames of a video, and always fills what they hid, from
-    frames that show it.
+    Convention: each pixel of the regions takes the label of the nearest pixel of another region, and is filled.
+    Arguments and errors are those of :func:`move_region`. If pairs of regions differ in softness, a new contour has
+    their mean softness. :func:`kcgs.video.delete_from_video` deletes regions from all frames of a video, and always
+    fills their pixels, from frames that show the background there.
 
     Example:
         >>> labels = torch.tensor([[0, 0, 3, 3, 3, 5]])
@@ -111,9 +111,9 @@ def delete_region(scene: Scene, region_ids: int | Iterable[int], *, fill: bool =
 
 
 def extract_region(scene: Scene, region_ids: int | Iterable[int]) -> Scene:
-    """Keep the Gaussians of some regions: the scene shows them where they were, and black elsewhere.
+    """Keep only the Gaussians of some regions: the new scene is black elsewhere.
 
-    The map stays whole, so that contours stay as they were: `num_regions` counts the other regions too, and the repr of
+    The map does not change, so that contours stay the same: `num_regions` counts the other regions too, and the repr of
     the scene says how many regions have no Gaussian. Arguments are those of :func:`move_region`; the map may be
     resized. :func:`render_region` renders regions with their membership as alpha.
 
@@ -128,15 +128,15 @@ def extract_region(scene: Scene, region_ids: int | Iterable[int]) -> Scene:
 
 
 def replace_background(scene: Scene, region_ids: int | Iterable[int], background: Scene) -> Scene:
-    """Put another scene in place of some regions, stretched to the size of this one.
+    """Put another scene, stretched to the size of this scene, in place of some regions.
 
     Convention: the regions of the background, or the background as one region, get ids above those of the scene.
-    Contours keep their softness. Where that of the scene differs by pairs of regions, a new contour has their mean.
+    Contours keep their softness. If pairs of regions of the scene differ in softness, a new contour has their mean.
 
     Args:
         scene: unbatched, with a map of its own size, not a resized one.
         region_ids: the regions that the background replaces: an id in the map, or several.
-        background: unbatched, with as many channels.
+        background: unbatched, with the same number of channels.
 
     Returns:
         A new scene, without a graph.
@@ -180,7 +180,7 @@ def _softness_of_one(regions: RegionMap) -> float | PairSoftness:
 
 
 def _with_softness(regions: RegionMap, softness: float | PairSoftness | None, first_id: int) -> RegionMap:
-    """Give contours between regions from `first_id` on the softness of a map in which their ids began with 0."""
+    """Give contours between regions with ids from `first_id` on the softness of a map where these ids began at 0."""
     before = _softness_of_one(regions)
     if softness is None or softness == before:
         return regions

@@ -17,16 +17,16 @@ from kcgs.scene import Scene, check_scene, check_type
 
 
 class Selection(NamedTuple):
-    """Regions of a scene."""
+    """Selected regions of a scene."""
 
     regions: RegionMap
     """The map of the scene."""
     ids: Tensor
-    """The ids of the selection, each once, sorted."""
+    """The ids of the selection, sorted, without duplicates."""
     pixels: Tensor
-    """Which pixels are of the selection, :math:`(H, W)` bool."""
+    """Mask of the pixels of the selection, :math:`(H, W)` bool."""
     members: Tensor
-    """Which Gaussians are, :math:`(N,)` bool."""
+    """Mask of the Gaussians of the selection, :math:`(N,)` bool."""
 
 
 def select_regions(scene: Scene, region_ids: object) -> Selection:
@@ -55,8 +55,8 @@ def select_removable_regions(scene: Scene, region_ids: object) -> Selection:
 
 
 def unique_region_ids(region_ids: object, known: Tensor, owner: str) -> list[int]:
-    """Return one id or several as a sorted list, each once, if all are among the `known` ids of the owner."""
-    has_one = getattr(region_ids, "ndim", 1) == 0  # such as labels[y, x], which has a method __iter__
+    """Return one or several ids as a sorted list without duplicates, if all are among the owner's `known` ids."""
+    has_one = getattr(region_ids, "ndim", 1) == 0  # such as labels[y, x]: it has the method __iter__, too
     sequence = region_ids if isinstance(region_ids, Iterable) and not has_one else [region_ids]
     ids = sorted({check_count("region_ids", region, 0) for region in sequence})
     if not ids:
@@ -70,12 +70,12 @@ def unique_region_ids(region_ids: object, known: Tensor, owner: str) -> list[int
 
 
 def members_of(field: GaussianField, ids: Tensor) -> Tensor:
-    """Return which Gaussians of a field with region ids belong to some regions, (..., N) bool."""
+    """Return the mask of the Gaussians that belong to some regions, (..., N) bool."""
     assert field.region_ids is not None
     return torch.isin(field.region_ids, ids)
 
 
 def warn_of_lost_regions(regions: RegionMap, labels: Tensor) -> None:
-    """Warn of regions that labels, of one image or of all frames, do not have any more."""
+    """Warn of regions that are no longer in the labels, of one image or of all frames."""
     if lost_ids := regions.ids[~torch.isin(regions.ids, labels)].tolist():
         warn_user(f"regions {', '.join(map(str, lost_ids))} are lost: covered, or out of the image")

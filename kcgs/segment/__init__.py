@@ -1,4 +1,4 @@
-"""Where label maps come from."""
+"""Segment images into label maps."""
 
 from kcgs.segment import methods  # registers all methods
 from kcgs.segment.cleanup import Cleanup, Prediction, Segmentation

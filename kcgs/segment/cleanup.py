@@ -25,14 +25,14 @@ _MIN_SHARE = 0.004
 
 @brief
 class Segmentation(NamedTuple):
-    """A label map, with a score and a name for every region where its method has them."""
+    """A label map, with a score and a name for every region if the method has scores and names."""
 
     labels: Tensor
     """:math:`(H, W)` int64, ids 0 to R - 1 by decreasing area."""
     scores: Tensor | None = None
     """:math:`(R,)` float32 in [0, 1], NaN for a region without a score; None: the method has no scores."""
     names: dict[int, str] | None = None
-    """By id; several regions may have one name. None: the method has no names."""
+    """Names by id; several regions may have the same name. None: the method has no names."""
 
 
 @brief
@@ -44,17 +44,17 @@ class Prediction(NamedTuple):
     scores: Any = None
     """:math:`(H, W)` in [0, 1], NaN for a pixel without a score; None: the method has no scores."""
     names: Sequence[str] | None = None
-    """Of the labels, from 0 on; None: the method has no names."""
+    """Names of the labels 0, 1, 2 and so on; None: the method has no names."""
 
 
 @dataclass(frozen=True)
 class Cleanup:
-    """Options of the clean-up, which does four things, in this order.
+    """Options of the clean-up; its four steps have this order.
 
     Args:
         snap: pixels by which contours may move onto edges of the image; 0: they stay.
         min_size: 4-connected pieces of fewer pixels join the neighbour with the longest common border, the smallest
-            piece first; at least 1, which leaves all; None: 0.4 % of the image, at least sqrt(H W).
+            piece first; at least 1, which keeps all pieces; None: 0.4 % of the image, at least sqrt(H W).
         connected: every 4-connected piece is a region of its own.
         max_regions: the two neighbours nearest in mean colour (CIE Lab) merge until at most this number of regions is
             left; None: all stay.
@@ -84,7 +84,7 @@ class Cleanup:
     def apply(self, image: Any, labels: Any) -> Segmentation:
         """Clean the labels of an image, or a `Prediction`.
 
-        The score of a region is the mean of its pixels, its name that of the label that most of its pixels have.
+        The score of a region is the mean over its pixels; its name is that of its most frequent label.
 
         Raises:
             TypeError, ValueError: no image; no labels or scores of its size; more labels than names.
@@ -117,7 +117,7 @@ class Cleanup:
         if self.snap:
             regions = snap_contours(rgb_to_lab(image), regions, self.snap)
         regions = merge_small(regions, self.smallest(regions.size))
-        # after merging, which can join the pieces of a region by what lay between them
+        # connect after merging: a merged piece can join the two pieces of a region on its sides
         regions = order_by_area(connect(regions) if self.connected else regions)
         if self.max_regions is not None and regions.max() >= self.max_regions:
             regions = order_by_area(merge_similar(rgb_to_lab(image), regions, self.max_regions))
@@ -151,8 +151,8 @@ def merge_small(labels: Labels, min_size: int, objects: Labels | None = None) ->
     """Merge every 4-connected piece under ``min_size`` pixels into the neighbour with the longest common border.
 
     The smallest piece is merged first, and a piece that reaches ``min_size`` by merging stays. Of neighbours with equal
-    borders the larger takes it, then the one whose first pixel comes earlier. Pieces that stay keep their label. Pieces
-    of different objects do not merge; labels must not cross their contours.
+    borders the larger takes the piece; of equally large neighbours, the one whose first pixel comes earlier. Other
+    pieces keep their label. Pieces of different objects do not merge; labels must not cross the contours of objects.
     """
     pieces = connect(labels)
     graph = RegionGraph(pieces, objects)
@@ -161,7 +161,7 @@ def merge_small(labels: Labels, min_size: int, objects: Labels | None = None) ->
     while queue:
         area, piece = heapq.heappop(queue)
         borders = graph.borders[piece]
-        if area != graph.areas[piece] or not borders:  # it has grown since, or is the whole image
+        if area != graph.areas[piece] or not borders:  # the piece has grown since, or is the whole image
             continue
         target = max(borders, key=lambda other: (borders[other], graph.areas[other], -other))
         graph.merge(piece, target)
@@ -186,7 +186,7 @@ def merge_similar(lab: NDArray[np.float32], regions: Labels, max_regions: int, o
 def clean(labels: Labels, min_size: int, objects: Labels | None = None) -> Labels:
     """Return 4-connected regions of at least ``min_size`` pixels, by decreasing area.
 
-    With objects, regions are divided by their contours first.
+    With objects, regions are first divided along the contours of objects.
     """
     if objects is not None:
         labels = labels * (int(objects.max()) + 1) + objects
@@ -203,7 +203,7 @@ def _region_means(regions: Labels, scores: NDArray[np.float64]) -> Tensor:
 
 
 def _region_names(regions: Labels, classes: Labels, names: Sequence[str]) -> dict[int, str]:
-    """Return the name of every region: that of the class that most of its pixels have."""
+    """Return the name of every region: the name of its most frequent class."""
     pairs = (regions * len(names) + classes).ravel()
     counts = np.bincount(pairs, minlength=(int(regions.max()) + 1) * len(names)).reshape(-1, len(names))
     return {region: names[label] for region, label in enumerate(counts.argmax(axis=1).tolist())}

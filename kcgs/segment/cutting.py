@@ -18,29 +18,29 @@ from kcgs.segment.prompts import Box, Point, Prompt, window_of
 from kcgs.segment.snapping import snap_contours
 
 # Tuned by the overlap with masks of DAVIS, from boxes and from masks of ISNet: `python -m benchmarks.objects`.
-# around the box, what GrabCut sees of the background, in sides of the box
+# width of the background around the box that GrabCut sees, in sides of the box
 _MARGIN = 0.3
-# pixels at which an object is segmented, at most; more give no better masks
+# largest number of pixels at which an object is segmented; more give no better masks
 _MAX_PIXELS = 60_000
-# steps from the box, and from each click
+# steps of GrabCut from the box, and from each click
 _BOX_STEPS = 5
 _CLICK_STEPS = 3
-# least and largest depth of a click in what it corrects, in sides of the box
+# least and largest depth of a click: its distance to the nearest contour, in sides of the box
 _LEAST_DEPTH = 0.03
 _MOST_DEPTH = 0.15
-# radius around a click of what surely has its label, in depths
+# radius around a click of the pixels that surely have its label, in depths
 _SURE_RADIUS = 0.5
-# radius of what has its label to begin with, in depths
+# radius of the pixels that start with its label, in depths
 _CHANGED_RADIUS = 1.5
-# radius of what may change, in depths
+# radius of the pixels that may change, in depths
 _OPEN_RADIUS = 3.0
-# least radius of what may change, in sides of the box
+# least radius of the pixels that may change, in sides of the box
 _LEAST_OPEN_RADIUS = 0.1
-# radius of what GrabCut sees around a click, in radii of what may change
+# half the side of the window around a click that GrabCut sees, in radii of the pixels that may change
 _SEEN_RADIUS = 1.5
-# pieces and holes of a smaller share of the box and its margin vanish
+# smallest pieces and holes that stay, as a share of the box with its margin
 _LEAST_PIECE = 0.002
-# pixels of the reduced image around a change, where the contour at full size changes with it
+# distance from a changed pixel within which the contour at full size may change, in pixels of the reduced image
 _FRINGE = 2
 # modes and labels of OpenCV; the lowest bit of a label is set for the object
 _INIT_WITH_MASK = 1
@@ -52,13 +52,13 @@ Mask = NDArray[np.uint8]
 
 
 def cut_from_box(image: Tensor, prompt: Prompt) -> Prediction:
-    """Cut an object out of an image (3, H, W) in [0, 1]: what differs from the colours around a box, and its clicks.
+    """Cut an object out of an image (3, H, W) in [0, 1]: its colours differ from those around a box; clicks correct it.
 
     Raises:
         ValueError: no object is found.
 
     Warns:
-        UserWarning: a click that the mask does not follow.
+        UserWarning: the mask does not follow a click.
     """
     assert prompt.box is not None
     crop = _Crop(image, prompt.box)
@@ -84,7 +84,7 @@ def correct_mask(image: Tensor, mask: Tensor, prompt: Prompt) -> Prediction:
 
 
 def _bounds(mask: Tensor, prompt: Prompt) -> Box:
-    """Return the box of a mask and of the clicks; without a mask, that of the image."""
+    """Return the bounding box of a mask and the clicks; for an empty mask, the whole image."""
     if not mask.any():
         return 0.0, 0.0, float(mask.shape[1]), float(mask.shape[0])
     y, x = (places.tolist() for places in mask.nonzero().T)
@@ -94,7 +94,7 @@ def _bounds(mask: Tensor, prompt: Prompt) -> Box:
 
 
 def _check_object(labels: Tensor, prompt: Prompt) -> Prediction:
-    """Return labels 0 and 1 of the background and an object, which must have a pixel; warn of clicks beside it."""
+    """Return labels, 0 for the background and 1 for the object; refuse an empty object; warn of clicks on the other."""
     if not labels.any():
         raise ValueError("no object is found: give a box around it, or a point of it as foreground")
     for (x, y), label in prompt.clicks:
@@ -139,7 +139,7 @@ class _Crop:
 
 
 def _cut_box(crop: _Crop) -> Mask:
-    """Return where the object of the box is, (h, w) of 0 and 1: what has other colours than what is around the box."""
+    """Return the mask of the object in the box, (h, w) of 0 and 1: its colours differ from those around the box."""
     left, top, right, bottom = crop.box
     labels = np.full(crop.pixels.shape[:2], _BACKGROUND, dtype=np.uint8)
     labels[math.floor(top) : math.ceil(bottom), math.floor(left) : math.ceil(right)] = _PERHAPS_OBJECT
@@ -149,7 +149,7 @@ def _cut_box(crop: _Crop) -> Mask:
 
 
 def _follow_clicks(crop: _Crop, mask: Mask, prompt: Prompt) -> Mask:
-    """Return a mask in which every click has changed what lies around it and is connected with it."""
+    """Return the mask after every click has changed the pixels around it that are connected with it."""
     clicks = [(crop.to_crop(point), label) for point, label in prompt.clicks]
     left, top, right, bottom = crop.box
     clicks = [((x, y), label) for (x, y), label in clicks if label or (left <= x < right and top <= y < bottom)]
@@ -162,7 +162,7 @@ def _follow_clicks(crop: _Crop, mask: Mask, prompt: Prompt) -> Mask:
 
 
 def _change(crop: _Crop, mask: Mask, sure: Mask, point: Point, label: int) -> NDArray[np.bool_]:
-    """Return where a click gives its label to pixels that have the other one."""
+    """Return the mask of the pixels that a click changes to its label."""
     from scipy import ndimage
 
     depth = _depth(mask, point, label, crop.side)
@@ -184,7 +184,7 @@ def _change(crop: _Crop, mask: Mask, sure: Mask, point: Point, label: int) -> ND
 
 
 def _run(pixels: NDArray[np.uint8], labels: Mask, steps: int) -> Mask:
-    """Run GrabCut from labels of OpenCV, (h, w), and return where the object is."""
+    """Run GrabCut from OpenCV's labels, (h, w), and return the mask of the object."""
     try:
         import cv2
     except ImportError as error:
@@ -192,22 +192,22 @@ def _run(pixels: NDArray[np.uint8], labels: Mask, steps: int) -> Mask:
             "this method needs the package opencv-python-headless: pip install opencv-python-headless"
         ) from error
     labels = np.ascontiguousarray(labels)
-    if len(np.unique(labels & 1)) == 2:  # else there is nothing to tell apart
-        cv2.setRNGSeed(0)  # of the k-means that it begins with
+    if len(np.unique(labels & 1)) == 2:  # GrabCut needs pixels of both labels
+        cv2.setRNGSeed(0)  # GrabCut begins with k-means
         models = np.zeros((1, 65)), np.zeros((1, 65))
-        # no rectangle, for the labels say what it would
+        # no rectangle: the labels replace it
         cv2.grabCut(np.ascontiguousarray(pixels), labels, (0, 0, 0, 0), models[0], models[1], steps, _INIT_WITH_MASK)
     return np.asarray(labels & 1, dtype=np.uint8)
 
 
 def _distances(mask: Mask, point: Point) -> NDArray[np.float64]:
-    """Return the distance of each pixel from that of a point."""
+    """Return the distance of each pixel from the pixel of a point."""
     y, x = (np.arange(n) for n in mask.shape)
     return np.hypot(x - math.floor(point[0]), (y - math.floor(point[1]))[:, None])
 
 
 def _depth(mask: Mask, point: Point, label: int, side: float) -> float:
-    """Return the distance from a click to the nearest contour, which tells how much is wrong around it."""
+    """Return the distance from a click to the nearest contour: a measure of the error's size around the click."""
     from scipy.ndimage import distance_transform_edt
 
     y, x = math.floor(point[1]), math.floor(point[0])

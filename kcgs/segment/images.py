@@ -11,14 +11,14 @@ from torch import Tensor
 from kcgs._image import as_image
 from kcgs.maps import Labels
 
-# by which values may pass [0, 1], as they do after resizing or colour conversion
+# distance by which values may lie outside [0, 1], as after resizing or colour conversion
 _TOLERANCE = 1e-3
-# pixels whose colour space is converted at a time, since the conversion needs the memory of six images
+# pixels that are converted to Lab at a time, since the conversion needs the memory of six images
 _BLOCK = 1 << 16
 
 
 def check_segment_image(image: Any) -> Tensor:
-    """Return an image as (3, H, W) float32 in [0, 1], grey repeated, with the channels of a pixel side by side."""
+    """Return an image as (3, H, W) float32 in [0, 1], grey repeated, with the memory layout of (H, W, 3)."""
     tensor = as_image("image", image, tolerance=_TOLERANCE).detach()
     if tensor.shape[0] not in (1, 3):
         raise ValueError(f"image must have shape (3, H, W) or (1, H, W); got {tuple(tensor.shape)}")
@@ -31,7 +31,7 @@ def to_pixels(image: Tensor) -> NDArray[np.float32]:
 
 
 def reduce_image(image: Tensor, max_pixels: int) -> Tensor:
-    """Return a checked image with `max_pixels` at most."""
+    """Return a checked image, reduced to at most `max_pixels`."""
     shrink = math.sqrt(image[0].numel() / max_pixels)
     if shrink <= 1:
         return image

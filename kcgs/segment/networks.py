@@ -1,4 +1,4 @@
-"""Networks: loading them, resizing and normalising images for them, and labels from their scores."""
+"""Load networks, resize and normalise images for them, and turn their scores into labels."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -16,13 +16,13 @@ IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 # characters of a library's error that are shown: some list every weight of a network
 _MAX_ERROR_LENGTH = 240
-# name of the pixels that are of no class
+# name of pixels without a class
 _BACKGROUND = "background"
 
 
 @contextmanager
 def library_errors(message: str) -> Iterator[None]:
-    """Raise any error of a library, for damaged files, weights of another network or odd values, as a ValueError."""
+    """Raise any error of a library, such as for damaged files or wrong weights, as a ValueError."""
     try:
         yield
     except Exception as error:
@@ -31,7 +31,7 @@ def library_errors(message: str) -> Iterator[None]:
 
 
 def load_pretrained(class_name: str, model: Any, device: torch.device) -> Any:
-    """Return a model of transformers in evaluation mode, from a folder, a hub id, or loaded already."""
+    """Return a model of transformers in evaluation mode; `model` is a folder, a hub id or a loaded model."""
     try:
         import transformers
     except ImportError as error:
@@ -58,10 +58,10 @@ def preprocess(
 def predict_labels(
     logits: Tensor, size: tuple[int, ...], names: Sequence[str] | None = None, threshold: float | None = None
 ) -> Prediction:
-    """Enlarge logits (C, h, w) to ``size``; the class of the largest is the label, its softmax the score.
+    """Enlarge logits (C, h, w) to ``size``; the class with the largest logit is the label, its softmax the score.
 
-    With a ``threshold``, a pixel whose largest sigmoid is at most the threshold is background: label 0, with one minus
-    that sigmoid as score; the other labels are one higher. Classes are enlarged one by one, which saves memory.
+    With a ``threshold``, a pixel is background if its largest sigmoid is at most the threshold: label 0, with 1 minus
+    this sigmoid as score; other labels increase by 1. Classes are enlarged one by one to save memory.
     """
     best = torch.full(size, -torch.inf, device=logits.device)
     total, labels = best.clone(), torch.zeros(size, dtype=torch.int64, device=logits.device)

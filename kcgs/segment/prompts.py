@@ -1,4 +1,4 @@
-"""A box and clicks that ask for one object."""
+"""Prompts for one object: a box and clicks."""
 
 import math
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ Box = tuple[float, float, float, float]
 
 
 class Prompt(NamedTuple):
-    """What says where an object is, in pixels."""
+    """The location of an object, in pixels."""
 
     box: Box | None
     """Left, top, right, bottom, within the image."""
@@ -31,9 +31,9 @@ class Prompt(NamedTuple):
 
 
 def check_prompt(image: Tensor, box: Points | None, foreground: Points | None, background: Points | None) -> Prompt:
-    """Return the prompt of an image (3, H, W): its box has pixels of the image, its points lie in the image.
+    """Validate a prompt for an image (3, H, W): the box has pixels of the image, and points lie in the image.
 
-    Points of the object lie in the box.
+    Points of the object must lie in the box.
     """
     height, width = image.shape[1:]
     corners = None
@@ -60,7 +60,7 @@ def _check_points(name: str, values: Points | None, width: int, height: int) -> 
     points = [] if values is None else _to_list(values)
     if isinstance(points, str) or not all(isinstance(point, Sequence) and len(point) == 2 for point in points):
         raise InvalidArgumentType(name, "a list of points (x, y)", repr(points))
-    # the right border of the image is that of its last pixel
+    # a point on the right or lower border of the image counts as in the last pixel
     return [
         (min(check_number(name, x, 0, width), width - 0.5), min(check_number(name, y, 0, height), height - 0.5))
         for x, y in points
@@ -68,7 +68,7 @@ def _check_points(name: str, values: Points | None, width: int, height: int) -> 
 
 
 def window_of(box: Box, margin: float, height: int, width: int) -> tuple[slice, slice]:
-    """Return the rows and columns of a box that is larger by a share of its sides, on each side."""
+    """Return the rows and columns of a box that is extended on each side by `margin`, a share of its length."""
     rows, columns = (
         slice(max(0, math.floor(low - margin * (high - low))), min(size, math.ceil(high + margin * (high - low))))
         for low, high, size in ((box[1], box[3], height), (box[0], box[2], width))

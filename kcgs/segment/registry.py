@@ -1,4 +1,4 @@
-"""Segmenters by name: a check of the image, the function of the method, one clean-up for all."""
+"""Segmenters by name: each call checks the image, runs the method's function, and cleans up its labels."""
 
 import inspect
 from collections.abc import Callable
@@ -60,7 +60,7 @@ def segment_with_scores(image: Any, method: str = "auto", **options: Any) -> Seg
 
     Returns:
         The label map of `segment`; a score in [0, 1] for every region, the mean over its pixels; and a name for every
-        region, a prompt or a class. None instead of scores or names that a method does not have.
+        region, a prompt or a class. Scores or names are None if the method has none.
 
     Example:
         >>> import torch
@@ -91,7 +91,7 @@ def available_methods() -> list[str]:
 
 
 def method_options(method: str) -> dict[str, Any]:
-    """Return the options of a method with their defaults, clean-up last; ``Parameter.empty`` where there is none.
+    """Return the options of a method with their defaults, clean-up last; ``Parameter.empty``: no default.
 
     Raises:
         ValueError: no such method.
@@ -117,7 +117,7 @@ def register(name: str, cleanup: Cleanup | None = None) -> Callable[[Function], 
     pixels. Optional libraries are imported inside the function.
 
     Args:
-        name: for `segment`; no other method has it.
+        name: a new name for `segment`.
         cleanup: the method's defaults of the clean-up options; None: those of `Cleanup`.
 
     Returns:

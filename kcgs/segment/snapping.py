@@ -1,4 +1,4 @@
-"""Contours of a label map moved onto the edges of the image."""
+"""Move the contours of a label map onto the edges of the image."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,11 +6,11 @@ from numpy.typing import NDArray
 from kcgs.maps import Labels, RegionGraph
 from kcgs.segment.images import lab_sums
 
-# share of the pixels of a region that lie further inside than `reach`, below which the region is a ribbon
+# a region is thin if less than this share of its pixels lies deeper inside than `reach`
 _CORE_SHARE = 0.1
 # distance of a mixed colour from the line between the two colours, in lengths of that line
 _MIXTURE_TOLERANCE = 0.25
-# distance of two colours in Lab
+# smallest visible distance of two colours in Lab
 _JUST_NOTICEABLE = 2.3
 # standard deviation of the smoothing before the gradient, in pixels
 _GRADIENT_SIGMA = 0.7
@@ -19,16 +19,16 @@ _GRADIENT_SIGMA = 0.7
 def snap_contours(lab: NDArray[np.float32], regions: Labels, reach: int) -> Labels:
     """Move contours of regions 0 to R - 1 by up to ``reach`` pixels onto the strongest edge of (H, W, 3).
 
-    Segmenters that smooth the image leave contours a pixel or two beside its edges, with whiskers, and make ribbons of
-    blurred edges. Here every region keeps its pixels that lie further inside than ``reach``. The watershed on the
-    gradient in CIE Lab divides the others. A ribbon is dissolved if its colour is a mixture of two neighbours, or
-    hardly differs from one; other regions too thin to have an inside stay. A region may fall into several pieces.
+    Segmenters that smooth the image leave contours a pixel or two beside its edges, with whiskers, and turn blurred
+    edges into thin regions. Here every region keeps its pixels that are deeper inside than ``reach``; the watershed on
+    the gradient in CIE Lab divides the other pixels. A thin region is dissolved if its colour is a mixture of two
+    neighbours, or hardly differs from one; other thin regions stay. A region may fall into several pieces.
     """
     from scipy.ndimage import binary_dilation
     from skimage.segmentation import watershed
 
     fixed = _fixed_pixels(lab, regions, reach)
-    # the watershed needs the open pixels and their rim only
+    # the watershed needs only the open pixels and their rim
     seeds = np.where(fixed, regions + 1, 0)
     band = binary_dilation(~fixed, np.ones((3, 3)))
     flooded = watershed(_gradient(lab), seeds, mask=band)
@@ -36,14 +36,14 @@ def snap_contours(lab: NDArray[np.float32], regions: Labels, reach: int) -> Labe
 
 
 def _fixed_pixels(lab: NDArray[np.float32], regions: Labels, reach: int) -> NDArray[np.bool_]:
-    """Return which pixels keep their label, (H, W)."""
+    """Return the mask of the pixels that keep their label, (H, W)."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     size = 2 * reach + 1
     core = minimum_filter(regions, size, mode="nearest") == maximum_filter(regions, size, mode="nearest")
     areas = np.bincount(regions.ravel())
     thin = np.bincount(regions[core], minlength=len(areas)) < _CORE_SHARE * areas
-    if thin.all():  # without any there would be no seed
+    if thin.all():  # the watershed would have no seed
         return np.ones_like(core)
     graph = RegionGraph(regions)
     means = lab_sums(lab, regions) / areas[:, None]

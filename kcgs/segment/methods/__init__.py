@@ -1,4 +1,4 @@
-"""The methods of segmentation. Each module in this folder is imported and registers its own; no list names it."""
+"""The methods of segmentation: each module in this folder is imported and registers its methods; there is no list."""
 
 from importlib import import_module
 from pkgutil import iter_modules

@@ -18,18 +18,18 @@ from kcgs.segment.images import lab_sums, reduce_image, rgb_to_lab
 from kcgs.segment.registry import register, segment_with_scores
 from kcgs.segment.snapping import snap_contours
 
-# Tuned by how contours agree with those of people on photos of BSDS500, and what a fit gains: see `auto`.
+# Tuned by the agreement of contours with human ones on photos of BSDS500, and by the gain of a fit: see `auto`.
 # standard deviation of the smoothing, in pixels
 _SIGMA = 1.2
-# scales of Felzenszwalb and Huttenlocher: the next one is tried while regions are few and not flat
+# scales of Felzenszwalb and Huttenlocher; the next scale is tried if there are few regions that are not flat
 _SCALES = (300.0, 150.0, 75.0)
-# regions from which on no finer scale is tried
+# with at least so many regions no finer scale is tried
 _MIN_REGIONS = 4
-# root mean square distance from the mean colour of a region that counts as flat, in Lab, where 2.3 is just noticeable
+# regions are flat below this root mean square distance from their mean colour, in Lab, where 2.3 is just noticeable
 _FLAT = 3.0
-# share of a finer region that must lie in one coarser region for the finer one to be a part of it
+# share of a finer region that must lie in one coarser region, so that it becomes a part of this region
 _PART_SHARE = 0.9
-# pixels at which images are segmented, at most; contours are then snapped at full size
+# largest number of pixels at which images are segmented; contours are then snapped at full size
 _MAX_PIXELS = 500_000
 # pixels of an image above which regions are also merged at the smaller size
 _LARGE = 2 * 1920 * 1080
@@ -38,26 +38,25 @@ _LARGE = 2 * 1920 * 1080
 @register("auto", Cleanup(max_regions=30))
 @image_threads_for_kernels
 def auto(image: Tensor, *, objects: Any = None, snap: int, min_size: int, max_regions: int | None) -> Prediction:
-    """Segment a photo into up to 30 clean connected regions, fewer where contours would save too little.
+    """Segment a photo into up to 30 clean connected regions, or fewer if contours would save too little error.
 
-    The method of Felzenszwalb and Huttenlocher, with its scale halved up to twice while fewer than 4 regions result
-    that are not nearly flat. Contours snap to edges, and pieces under ``min_size`` join a neighbour. Regions merge
-    whose contour saves less error than it costs (`merge_regions`), then the most similar neighbours until
-    ``max_regions`` are left. An image that needs no contour gives one region.
+    This is the method of Felzenszwalb and Huttenlocher. Its scale is halved up to twice, while it gives fewer than 4
+    regions and these are not nearly flat. Contours snap to edges, and pieces under ``min_size`` join a neighbour.
+    Neighbours merge if their contour saves less error than it costs (`merge_regions`); then the most similar neighbours
+    merge until ``max_regions`` are left. An image that needs no contour gives one region.
 
-    On 21 photos of BSDS500 some three fifths of the contours lie within 3 pixels of human ones, and half of the human
-    ones have a contour within 3 pixels. Where no colour differs across most of a contour, as along texture, soft
-    transitions and foliage, there is none. With 400 Gaussians a fit gains 0.52 dB by these maps
-    (`python -m benchmarks maps`).
+    On 21 photos of BSDS500, about three fifths of the contours are within 3 pixels of a human contour, and half of the
+    human contours are within 3 pixels of one of these. Texture, soft transitions and foliage have no contour where
+    colours hardly differ across it. With 400 Gaussians a fit gains 0.52 dB by these maps (`python -m benchmarks maps`).
 
-    With objects no region crosses their contours, so that an edit has all of an object in regions of its own. Their
-    names are those of the objects.
+    With objects, no region crosses the contour of an object, so that an object consists of whole regions. Regions have
+    the names of their objects.
 
     Args:
         image: as `segment` takes it, any size.
         objects: a label map of the image's size, as :func:`kcgs.fit` takes it, whose ids are the names; or "object":
-            the main object, which the method of this name finds; None: areas of similar colour only. Pieces under
-            ``min_size`` are part of what is around them.
+            the main object, found by the method "object"; None: areas of similar colour only. Pieces of objects under
+            ``min_size`` join their surroundings.
         snap: of the clean-up; 0 with objects.
         min_size: of the clean-up, in pixels.
         max_regions: of the clean-up.
@@ -90,7 +89,7 @@ def auto(image: Tensor, *, objects: Any = None, snap: int, min_size: int, max_re
 
 
 def _find_objects(image: Tensor, objects: Any, min_size: int) -> tuple[Labels, list[str]]:
-    """Return a map of objects without small pieces, from 0 on, and the name of each."""
+    """Return a map of objects without small pieces, with labels from 0, and the name of each label."""
     if isinstance(objects, str) and objects == "object":
         labels, _, names = segment_with_scores(image, "object", min_size=min_size)
         assert names is not None
@@ -103,7 +102,7 @@ def _find_objects(image: Tensor, objects: Any, min_size: int) -> tuple[Labels, l
 
 
 def _divide(image: Tensor, objects: Labels | None, min_size: int, max_regions: int | None) -> Labels:
-    """Return the regions of an image, of which none crosses the contour of an object."""
+    """Return the regions of an image; no region crosses the contour of an object."""
     if image[0].numel() <= _LARGE:
         regions = _regions(image, objects, min_size)
     else:
@@ -159,15 +158,15 @@ def _enlarge(image: Tensor, regions: Labels) -> Labels:
 
 
 def _resize(labels: Labels, size: tuple[int, ...]) -> Labels:
-    """Return a map at another size, each pixel with the label of the nearest one."""
+    """Resize a label map: each pixel takes the label of the nearest pixel."""
     maps = torch.from_numpy(labels)[None, None].double()
     return F.interpolate(maps, size, mode="nearest")[0, 0].long().numpy()
 
 
 def _refine(coarse: Labels, fine: Labels, min_size: int, objects: Labels | None) -> Labels:
-    """Divide regions of ``coarse`` by the regions of ``fine`` that lie within one of them.
+    """Divide regions of ``coarse`` by the regions of ``fine`` that lie within a single coarse region.
 
-    The coarse map has the better contours: a region of the finer map that crosses them is left out.
+    The coarse map has better contours: regions of the fine map that cross them are ignored.
     """
     count = int(coarse.max()) + 1
     overlap = np.bincount((fine * count + coarse).ravel(), minlength=count * (int(fine.max()) + 1)).reshape(-1, count)

@@ -1,4 +1,4 @@
-"""Regions of alike patch features, by DINO, DINOv2 or DINOv3."""
+"""Regions of similar patch features, by DINO, DINOv2 or DINOv3."""
 
 import inspect
 import os
@@ -14,9 +14,9 @@ from kcgs.segment.clustering import k_means
 from kcgs.segment.networks import load_pretrained, preprocess
 from kcgs.segment.registry import register
 
-# variance of colour below which the guided filter smooths
+# the guided filter smooths where the variance of colour is below this
 _GUIDE_EPS = 1e-3
-# least mean distance of features to the centres of their clusters, one minus a cosine
+# least mean distance of features to the centres of their clusters, as 1 - cosine
 _MIN_SPREAD = 1e-3
 
 
@@ -30,16 +30,16 @@ def dino(
 ) -> Prediction:
     """Segment by k-means of the patch features of a self-supervised vision transformer.
 
-    Features are made unit length and clustered. Memberships of the patches (softmax of cosine similarity to the
-    clusters' means) are enlarged to pixels and follow the image's edges by guided filtering (He et al., TPAMI 2013),
-    two patches wide; the largest wins and is the score.
+    Features of unit length are clustered. The membership of a patch in a cluster is the softmax of its cosine
+    similarities to the clusters' means. Memberships are enlarged to pixels, and a guided filter (He et al., TPAMI
+    2013), two patches wide, aligns them with the image's edges. The largest membership gives the label and the score.
 
     Args:
         image: as `segment` takes it, any size.
         model: a hub id, a local folder or a loaded model of transformers: DINO ("facebook/dino-vits16"), DINOv2 with or
             without registers, DINOv3 ("facebook/dinov3-vits16-pretrain-lvd1689m"), or another plain vision transformer.
         num_clusters: k, at least 1.
-        longer_side: of the image that the model sees, in pixels, rounded to whole patches, at least 1.
+        longer_side: longer side of the image that the model sees, in pixels, rounded to whole patches, at least 1.
 
     Raises:
         ValueError: ``model`` cannot be loaded or has no patches.
@@ -69,7 +69,7 @@ def patch_features(image: Tensor, model: str | os.PathLike[str] | Any, longer_si
         raise ValueError(f"model must be a vision transformer with patches; got {type(network).__name__}")
     longer = max(image.shape[1:])
     rows, columns = (max(1, round(side * longer_side / longer / patch)) for side in image.shape[1:])
-    # DINO has to be asked to take another number of patches; later models do it by themselves
+    # DINO takes another number of patches only with this option; later models always do
     options = {"interpolate_pos_encoding"} & inspect.signature(network.forward).parameters.keys()
     with torch.no_grad():
         pixels = preprocess(image, (rows * patch, columns * patch))
@@ -84,7 +84,7 @@ def _enlarge_along_edges(image: Tensor, memberships: Tensor, patch: float) -> Te
 
     size = (image.shape[1], image.shape[2])
     large = F.interpolate(memberships[None], size, mode="bilinear", align_corners=False)
-    # odd, and no window reaches beyond a border further than the image is large
+    # sides are odd, and less than twice the image's: a window must not reach beyond a border by more than the image
     height, width = (min(2 * round(patch) + 1, 2 * side - 1) for side in size)
     guided = guided_blur(image[None], large, (height, width), _GUIDE_EPS, border_type="replicate")
     return torch.as_tensor(guided[0]).clamp(0, 1)

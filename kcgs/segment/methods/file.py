@@ -12,12 +12,12 @@ from kcgs.segment.registry import register
 def file(image: Tensor, *, path: str | os.PathLike[str], threshold: float | None = None) -> Tensor:
     """Take the regions of an image from a mask on disk.
 
-    By default nothing is cleaned: no piece is too small, and a label in several pieces is one region.
+    By default there is no clean-up: small pieces stay, and a label in several pieces is one region.
 
     Args:
         image: as `segment` takes it.
-        path: what `kcgs.data.load_labels` reads, of the image's size.
-        threshold: of a mask with soft edges, as `kcgs.data.load_labels` has it.
+        path: a file that `kcgs.data.load_labels` reads, of the image's size.
+        threshold: for a mask with soft edges, as in `kcgs.data.load_labels`.
 
     Raises:
         FileNotFoundError: ``path`` does not exist.

@@ -1,4 +1,4 @@
-"""Regions of alike colours."""
+"""Regions of similar colours."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ def kmeans(image: Tensor, *, num_clusters: int = 6, sigma: float = 1.0) -> NDArr
     Args:
         image: as `segment` takes it.
         num_clusters: k, at least 1.
-        sigma: standard deviation of the smoothing beforehand, in pixels, at least 0.
+        sigma: standard deviation of the smoothing before clustering, in pixels, at least 0.
 
     Example:
         >>> import torch

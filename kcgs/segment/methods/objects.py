@@ -19,7 +19,7 @@ from kcgs.segment.prompts import Points, check_prompt, window_of
 from kcgs.segment.registry import register
 
 _RELEASE = "https://github.com/danielgatis/rembg/releases/download/v0.0.0"
-# where rembg keeps its weights, too
+# the folder of weights, shared with rembg
 _FOLDER_VARIABLE = "U2NET_HOME"
 _FOLDER = "~/.u2net"
 
@@ -43,9 +43,9 @@ _WEIGHTS = {
     "u2netp": _Weights("u2netp.onnx", "8e83ca70e441ab06c318d82300c84806"),
 }
 _DEFAULT = "isnet-general-use"
-# what the network sees around a box, in sides of the box: with less it takes parts for the whole
+# width of the surroundings of a box that the network sees, in sides of the box: with less it mistakes parts for objects
 _VIEW = 0.8
-# of what the network sees: smaller specks and holes of its mask vanish; those that are larger are parts, such as spokes
+# smallest pieces and holes that stay, as a share of the network's view; larger ones are parts, such as spokes
 _LEAST_PIECE = 2e-4
 
 
@@ -63,28 +63,28 @@ def find_object(
     """Separate the main object of a photo from the rest.
 
     The networks are ISNet (Qin et al., "Highly Accurate Dichotomous Image Segmentation", ECCV 2022), BiRefNet (Zheng et
-    al., CAAI AIR 2024) and U-2-Net's small one, as the project rembg publishes them in ONNX: 179 MB, 973 MB and 4.6 MB.
-    They are downloaded once, into ~/.u2net or the folder U2NET_HOME, where rembg keeps them, too. With a box the
-    network sees the box and what is around it, and the object is what it finds in the box. Clicks correct the mask
-    as they do for the method "grabcut". The names of regions are "object" and "background".
+    al., CAAI AIR 2024) and the small U-2-Net, in ONNX files of the project rembg: 179 MB, 973 MB and 4.6 MB. They are
+    downloaded once, into ~/.u2net or the folder U2NET_HOME, as by rembg. With a box, the network sees the box and its
+    surroundings, and the object is its mask inside the box. Clicks correct the mask as in the method "grabcut". The
+    names of regions are "object" and "background".
 
     Args:
         image: as `segment` takes it, any size.
-        model: isnet-general-use, birefnet-general, u2netp, or an ONNX file: by its name one of theirs, else ISNet's;
-            the method "onnx" takes other networks.
-        threshold: of the object's score, in [0, 1].
-        pieces: every connected piece of the object is a region of its own; False: all are one.
-        box: left, top, right, bottom in pixels, around the object that is meant; None: the whole image.
+        model: isnet-general-use, birefnet-general or u2netp; or an ONNX file with the name of one of their files, or
+            else a network with the normalisation of ISNet. The method "onnx" takes other networks.
+        threshold: least score of the object's pixels, in [0, 1].
+        pieces: True: every connected piece of the object is a region of its own; False: all pieces are one region.
+        box: left, top, right, bottom in pixels, around the object; None: the whole image.
         foreground: :math:`(P, 2)` points (x, y) that the network missed, in pixels, in the box.
-        background: :math:`(P, 2)` points (x, y) of what it took by mistake.
+        background: :math:`(P, 2)` points (x, y) that the network took by mistake.
 
     Raises:
-        ValueError: no such model, weights that cannot be had, or a file that is no such network; a box without pixels
-            of the image, points outside of it or of the box; no object is found.
-        ImportError: OpenCV is not installed, which clicks need.
+        ValueError: an unknown model, weights that cannot be downloaded, or a file that is no such network; a box
+            without pixels of the image; points outside of the image or of the box; no object is found.
+        ImportError: clicks need OpenCV, and it is not installed.
 
     Warns:
-        UserWarning: a click that the mask does not follow.
+        UserWarning: the mask does not follow a click.
 
     Example:
         ``segment(image, "object")``
@@ -102,7 +102,7 @@ def find_object(
     mask[inside] = labels[inside]
     mask = torch.from_numpy(merge_small(mask.numpy(), max(1, round(_LEAST_PIECE * labels[view].numel()))))
     prediction = correct_mask(image, mask > 0, prompt)
-    scores[prediction.labels != labels] = torch.nan  # these are the network's, of the other label
+    scores[prediction.labels != labels] = torch.nan  # the network's score is of the other label
     prediction = prediction._replace(scores=scores)
     return _label_pieces(prediction) if pieces else prediction
 
@@ -116,7 +116,7 @@ def _label_pieces(prediction: Prediction) -> Prediction:
 
 
 def _find_weights(model: str | os.PathLike[str]) -> tuple[Path, _Weights]:
-    """Return the file of a network and its normalisation; download it where it is not there."""
+    """Return the file of a network and its normalisation; download the file if it is missing."""
     if (weights := _WEIGHTS.get(str(model))) is None:
         if Path(model).suffix != ".onnx":
             raise InvalidArgument("model", f"one of {', '.join(_WEIGHTS)}, or an ONNX file", repr(str(model)))
@@ -130,14 +130,14 @@ def _find_weights(model: str | os.PathLike[str]) -> tuple[Path, _Weights]:
 
 
 def _download(url: str, path: Path, md5: str) -> None:
-    """Fetch weights, whole or not at all, with a progress bar on a terminal."""
+    """Download weights atomically, with a progress bar on a terminal."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as temporary:
             torch.hub.download_url_to_file(url, str(temporary), progress=os.isatty(2))
             if hashlib.md5(temporary.read_bytes(), usedforsecurity=False).hexdigest() != md5:
                 raise OSError("the file has another checksum")
-    except OSError as error:  # of the network, too
+    except OSError as error:  # includes network errors
         reason = " ".join(str(error).split())
         hint = f"download {url} to {path}, or pass model=FOLDER/{path.name}"
         raise ValueError(f"cannot load the weights of {path.stem}: {reason}; {hint}") from error

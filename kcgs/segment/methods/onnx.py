@@ -16,11 +16,11 @@ from kcgs.segment.cleanup import Prediction
 from kcgs.segment.networks import IMAGENET_MEAN, IMAGENET_STD, library_errors, predict_labels, preprocess
 from kcgs.segment.registry import register
 
-# by which the sum of probabilities over the classes may miss 1; half precision misses it by some 1e-3
+# largest distance from 1 of a sum of probabilities over the classes; half precision misses 1 by about 1e-3
 _SUM_TOLERANCE = 1e-2
-# probabilities are clamped to this before their logarithm
+# least probability before the logarithm
 _MIN_PROBABILITY = 1e-6
-# of LSeg's text encoder, CLIP: cosine similarities over it are logits
+# temperature of CLIP, LSeg's text encoder: logits are cosine similarities divided by it
 _TEMPERATURE = 0.07
 
 
@@ -37,22 +37,22 @@ def onnx(
 ) -> Prediction:
     """Segment by a network in ONNX, run by onnxruntime on the CPU.
 
-    The image is resized to the network's input (bilinear, antialiased), less ``mean``, over ``std``; the first output
-    is resized to the image. Its shape and values say what it means:
+    The image is resized to the network's input (bilinear, antialiased) and normalised by ``mean`` and ``std``. The
+    network's first output is resized to the image. Shape and values of the output determine its meaning:
 
-    - integers, (1, h, w) or (1, 1, h, w): class numbers; they have no scores.
-    - (1, C, h, w), C > 1: probabilities where they sum to 1, else logits; the largest wins, its softmax is the score.
-    - (1, 1, h, w) or (1, h, w): saliency where it lies in [0, 1], stretched to that range as U-2-Net's own code does,
-      else logits; foreground, label 1, is what is above ``threshold``.
+    - integers, (1, h, w) or (1, 1, h, w): class numbers, without scores.
+    - (1, C, h, w), C > 1: probabilities if they sum to 1, else logits; the largest wins, its softmax is the score.
+    - (1, 1, h, w) or (1, h, w): saliency if all values are in [0, 1], stretched to this range as in U-2-Net's code;
+      else logits. Pixels above ``threshold`` are foreground, label 1.
 
     Args:
         image: as `segment` takes it, any size.
         model: an ONNX file with one input (1, 3, h, w), float or half.
         threshold: of the foreground's score, in [0, 1], for one-channel outputs.
-        size: (h, w) of an input whose size is free; None: the image's own.
+        size: (h, w) of the input if the network has no fixed size; None: the image's size.
         mean: three numbers, for images in [0, 1].
         std: three numbers above 0; 1 / 255 each for a network that reads images in [0, 255].
-        names: of the classes, class 0 first; of one-channel outputs two, the background's first.
+        names: names of the classes, class 0 first; for one-channel outputs two names, the background's first.
 
     Raises:
         TypeError, ValueError: an argument is out of its range, or ``model`` is no such network or does not run.
@@ -109,14 +109,14 @@ def lseg(
 ) -> Prediction:
     """Segment by language as LSeg does (Li et al., ICLR 2022): pixel features against text embeddings.
 
-    The label of a pixel is the class with the largest cosine similarity, its score the softmax of the similarities over
-    CLIP's temperature, 0.07.
+    The label of a pixel is the class with the largest cosine similarity. Its score is the softmax of the similarities
+    divided by CLIP's temperature, 0.07.
 
     Args:
         image: as `segment` takes it, any size.
         model: LSeg's image encoder, an ONNX file from (1, 3, h, w) to features (1, D, h', w').
         embeddings: a CLIP text embedding for each class, (K, D): an .npy file or an array.
-        size: as of `onnx`, such as ``mean`` and ``std``.
+        size: as in the method "onnx", like ``mean`` and ``std``.
         mean: three numbers.
         std: three numbers above 0.
         names: of the K classes.

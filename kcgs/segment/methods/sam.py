@@ -17,10 +17,10 @@ from kcgs.segment.registry import register
 
 # prompts per pass of the network
 _BATCH = 16
-# of Segment Anything's automatic generator: overlap of the masks at logits above and below 0 by the offset
+# as in Segment Anything's automatic generator: least overlap of the masks at logits above +offset and above -offset
 _MIN_STABILITY = 0.95
 _STABILITY_OFFSET = 1.0
-# intersection over union of two masks
+# largest intersection over union of two masks that are both kept
 _MAX_OVERLAP = 0.7
 
 
@@ -37,12 +37,12 @@ def sam(
 ) -> Prediction:
     """Segment by Segment Anything (Kirillov et al., ICCV 2023) or SAM 2 (Ravi et al., ICLR 2025).
 
-    A box, points of an object, or both ask for this object and get its best mask. Without them, a grid of points asks
-    for everything: of the three masks per point those are taken that the model scores at least ``min_score`` and that
-    hardly depend on the threshold. Of two masks that overlap by more than 0.7 (intersection over union) the better is
-    taken. Smaller masks lie over larger ones. Each connected piece that no mask covers is a region too. The score of a
-    region is the overlap that the model predicts for its mask, NaN without a mask. With a prompt the names of
-    regions are "object" and "background".
+    A box, points of an object, or both prompt for this object; the result is its best mask. Without them, the prompts
+    are a grid of points, with three masks per point. A mask is kept if the model scores it at least ``min_score`` and
+    it hardly depends on the threshold. Of two masks that overlap by more than 0.7 (intersection over union) the better
+    is kept. Smaller masks lie over larger ones. Each connected piece that no mask covers is a region too. The score of
+    a region is the overlap that the model predicts for its mask, NaN without a mask. With a prompt the names of regions
+    are "object" and "background".
 
     Args:
         image: as `segment` takes it, any size.
@@ -50,9 +50,9 @@ def sam(
             ``SamModel`` or ``Sam2Model``.
         box: left, top, right, bottom of one object, in pixels.
         foreground: :math:`(P, 2)` points (x, y) of the object, in pixels, in the box if there is one.
-        background: :math:`(P, 2)` points (x, y) that are not of it.
-        grid: points along each side where there is no prompt, at least 1.
-        min_score: of the grid's masks, in [0, 1], against the overlap that the model predicts.
+        background: :math:`(P, 2)` points (x, y) that are not of the object.
+        grid: number of points along each side, without a prompt, at least 1.
+        min_score: least overlap, in [0, 1], that the model predicts for a mask of the grid.
 
     Raises:
         ValueError: an argument has another shape or is out of its range, or the weights do not fit the model.
@@ -130,9 +130,10 @@ def _predict_masks(network: Any, square: Tensor, prompts: dict[str, Tensor], sca
 
 
 def suppress_duplicates(masks: Tensor, scores: Tensor, max_overlap: float) -> list[int]:
-    """Return indices of masks (M, h, w) from large to small, without those that overlap a better mask too much.
+    """Return indices of masks (M, h, w), the largest first, without masks that overlap a better mask too much.
 
-    Overlap is intersection over union. Of equal scores (M,) the earlier is the better; of equal areas it comes last.
+    Overlap is intersection over union. Of masks with equal scores (M,) the earlier is better. Of masks with equal
+    areas the better comes last.
     """
     flat = masks.flatten(1).float()
     areas = flat.sum(dim=1)

@@ -1,4 +1,4 @@
-"""The segmenters of scikit-image: nothing to download, the same map every time."""
+"""The segmenters of scikit-image: deterministic, without downloads."""
 
 import functools
 import inspect
@@ -20,7 +20,7 @@ _SUPERPIXELS = Cleanup(snap=2, max_regions=20)
 
 
 class _Segmenter:
-    """A function of ``skimage.segmentation`` with defaults for photos. Its signature is read when it is needed."""
+    """A function of ``skimage.segmentation`` with defaults for photos; its signature is read on use."""
 
     def __init__(self, name: str, convert: Callable[[Tensor], NDArray[Any]], **defaults: Any) -> None:
         self.name = name
@@ -41,7 +41,7 @@ class _Segmenter:
         return signature.replace(parameters=[*signature.parameters.values(), max_regions])
 
     def __call__(self, image: Tensor, *, max_regions: int | None, **options: Any) -> Tensor:
-        """Return the segments, of which neighbours of like colour merge to ``max_regions``."""
+        """Return the segments, after the most similar neighbours have merged to ``max_regions``."""
         defaults = inspect.signature(self._function).parameters
         for name, value in options.items():
             if type(defaults[name].default) is int:

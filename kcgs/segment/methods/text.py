@@ -27,14 +27,14 @@ def text(
     """Segment by words, through CLIPSeg (Lüddecke and Ecker, CVPR 2022).
 
     Every pixel goes to the prompt with the largest logit; its score is the softmax over the prompts. With a
-    ``threshold``, a pixel whose largest sigmoid is at most the threshold is background; scores are then that sigmoid,
-    and one minus it in the background. Names of regions are prompts, or "background".
+    ``threshold``, a pixel is background if its largest sigmoid is at most the threshold. The score is then this
+    sigmoid, or 1 minus it in the background. Names of regions are prompts, or "background".
 
     Args:
         image: as `segment` takes it, any size.
         prompts: what to look for, such as ``["a dog", "grass"]``; at least one, and without a
             ``threshold`` at least two.
-        model: a hub id, a local folder or a loaded ``CLIPSegForImageSegmentation``; its tokenizer is beside it.
+        model: a hub id, a local folder or a loaded ``CLIPSegForImageSegmentation``; its tokenizer has the same source.
         threshold: of the foreground's score, in [0, 1]; None: there is no background.
 
     Raises:
