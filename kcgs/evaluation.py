@@ -19,15 +19,15 @@ def evaluate(scene: Scene, image: Any, labels: Any = None, *, with_ssimulacra2: 
     Args:
         scene: unbatched.
         image: of the scene's size and channels, as :func:`kcgs.fit` takes it.
-        labels: a map as :func:`kcgs.fit` takes it, with the contours of the edge-focused metrics; None: the scene's
-            own, which a fit may have moved. The history of a fit and `kcgs fit` take the map of their input: pass it
-            for the same numbers.
-        with_ssimulacra2: whether `ssimulacra2` is among the metrics; it takes about 0.3 s for 480 x 854.
+        labels: the map with the contours for the edge-focused metrics, as :func:`kcgs.fit` takes it; None: the scene's
+            map, whose contours a fit may have moved. The history of a fit and `kcgs fit` measure along the map of their
+            input: pass that map for the same numbers.
+        with_ssimulacra2: compute `ssimulacra2` too; it takes about 0.3 s for 480 x 854 pixels.
 
     Returns:
-        By name: psnr (dB), ssim, ms_ssim, within 5 pixels of the contours ef_psnr (dB) and ef_ssim, and ssimulacra2.
-        A metric that is not defined is NaN: MS-SSIM below 161 pixels per side, the edge-focused metrics without
-        contours, SSIMULACRA2 without its package, which `pip install ssimulacra2` brings.
+        The metrics by name: psnr (dB), ssim, ms_ssim, ef_psnr (dB) and ef_ssim within 5 pixels of the contours, and
+        ssimulacra2. A metric that is not defined is NaN: MS-SSIM below 161 pixels per side, the edge-focused metrics
+        without contours, SSIMULACRA2 without its package (`pip install ssimulacra2`).
 
     Raises:
         TypeError: arguments of the wrong type.

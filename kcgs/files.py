@@ -1,4 +1,4 @@
-"""Scenes in files, of the format that the suffix names."""
+"""Save and load scenes; the suffix selects the format of the file."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ def save(
     objective: str | None = None,
     seed: int | None = None,
 ) -> int:
-    """Write a scene. The file appears whole or not at all, and the same arguments give the same bytes.
+    """Write a scene to a file, atomically; the same arguments give the same bytes.
 
-    Convention: a .safetensors file keeps every bit, and takes none of the keywords. A .kcgs file is rounded, and keeps
-    no metadata. With the image that the scene shows, :func:`kcgs.rate.compress` writes it, so that Gaussians make up
-    for each other's rounding; else :func:`kcgs.codec.encode`.
+    Convention: a .safetensors file is exact to the bit, and takes no keywords. A .kcgs file is rounded, and stores no
+    metadata. If `image` is given, :func:`kcgs.rate.compress` writes the .kcgs file, so that Gaussians correct each
+    other's rounding errors; otherwise :func:`kcgs.codec.encode` does.
 
     Args:
         path: ends in .safetensors or in .kcgs; its folder must exist.
-        scene: N Gaussians, or (.safetensors only) a batch of them.
-        image: what :func:`kcgs.fit` takes, of the scene's size and channels.
-        quality: PSNR in dB of the file's render against the scene's. None: with an image, so much that the file is
-            nearly as good as the scene; else 46.
-        target_bytes: the most bytes of the file, in place of `quality`.
-        target_psnr: in dB against the image, in place of both.
-        objective: l2 or ms-ssim, what is lowered with an image. None: ms-ssim with `target_bytes`, else l2.
+        scene: N Gaussians, or (.safetensors only) a batch of scenes.
+        image: the image that the scene was fitted to, as in :func:`kcgs.fit`, of the scene's size and channels.
+        quality: PSNR in dB of the file's render against the scene's render. None: 46; with an image, a quality at
+            which the file is nearly as good as the scene.
+        target_bytes: largest size of the file in bytes, in place of `quality`.
+        target_psnr: PSNR in dB against the image, in place of both.
+        objective: l2 or ms-ssim, lowered if there is an image. None: ms-ssim with `target_bytes`, else l2.
         seed: of the order in which Gaussians are rounded, with an image. None: 0.
 
     Returns:
@@ -79,16 +79,16 @@ def load(path: str | os.PathLike[str]) -> Scene:
     """Read a scene.
 
     Args:
-        path: a .safetensors file that :func:`save` wrote, or a whole .kcgs file; the beginning of one is read by
-            :func:`kcgs.codec.decode`. "zoo:NAME" is a scene that comes with the package.
+        path: a .safetensors file that :func:`save` wrote, or a complete .kcgs file; :func:`kcgs.codec.decode` reads
+            the beginning of a .kcgs file. "zoo:NAME" is a scene that comes with the package.
 
     Returns:
         The scene, on the CPU; from .safetensors bit for bit as saved. Region ids and labels are int64.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: another suffix; the file is damaged, no scene, or of another format version; the message names
-            the path. No such scene in the zoo.
+        ValueError: another suffix; the file is damaged, no scene, or of another format version (the message names the
+            path); the zoo has no such scene.
 
     Example:
         >>> import tempfile, torch

@@ -1,4 +1,4 @@
-"""The figure of a fit, in colours that people with any colour vision tell apart."""
+"""The figure of a fit, in colours that people with any colour vision can tell apart."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import io
 from collections.abc import Sequence
 from typing import Any
 
-# of Okabe and Ito
+# palette of Okabe and Ito
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
 
 
@@ -17,7 +17,7 @@ def history_figure(history: Sequence[Any]) -> Any:
     from matplotlib.figure import Figure
 
     class NotebookFigure(Figure):
-        """A figure that a notebook shows; of matplotlib's own it shows only those of pyplot."""
+        """A figure that a notebook shows; without this class it would show only figures of pyplot."""
 
         def _repr_png_(self) -> bytes:
             self.savefig(file := io.BytesIO(), dpi=100)

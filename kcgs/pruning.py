@@ -15,30 +15,30 @@ from kcgs.scene import Scene, check_scene
 
 @brief
 class PruneResult(NamedTuple):
-    """A scene with fewer Gaussians; of a batch, one number for each image."""
+    """A pruned scene, with numbers for one image, or (B,) tensors for a batch."""
 
     scene: Scene
     num_pruned: int | Tensor
-    """Number of Gaussians that were removed, or (B,): that have the colour 0 now, and had another."""
+    """Number of removed Gaussians; (B,) for a batch: Gaussians whose colour became 0."""
     prune_error: float | Tensor
-    """Largest change of a value of the image, or (B,)."""
+    """Largest change of a value of the image; (B,) for a batch."""
 
 
 def prune(scene: Scene, tolerance: float = 1e-3, *, cutoff: float = 1e-4, backend: str = "auto") -> PruneResult:
     """Remove as many Gaussians as possible while no value of the image changes by more than `tolerance`.
 
-    Gaussians that paint least go first. The tolerance bounds their sum: the image that all of them render, with the
-    absolute values of their colours, is nowhere above it. In a batch, whose images have as many rows, Gaussians keep
-    their row and get the colour 0.
+    Gaussians with the smallest effect on the image are removed first. The tolerance bounds the sum of their effects:
+    a render of all removed Gaussians with the absolute values of their colours nowhere exceeds it. In a batch all
+    images have the same number of rows, so removed Gaussians keep their row and get the colour 0.
 
     Args:
         scene: of one image, or a batch.
-        tolerance: largest change of a value of the image, at least 0; 0 removes Gaussians that paint nothing.
+        tolerance: largest change of a value of the image, at least 0; 0 removes Gaussians without any effect.
         cutoff: of the renderer.
         backend: of the renderer.
 
     Returns:
-        The scene that remains (no graph), the number of Gaussians removed, and the largest change, measured.
+        The pruned scene (no graph), the number of removed Gaussians, and the measured largest change.
 
     Raises:
         TypeError, ValueError: as the renderer; tolerance negative or not finite.
@@ -66,7 +66,7 @@ def prune(scene: Scene, tolerance: float = 1e-3, *, cutoff: float = 1e-4, backen
     order = _effects(scene, render).argsort(stable=True)
     magnitudes = _recolor(scene, scene.field.merged_colors().detach().abs())
     with torch.no_grad():
-        low, high = 0, scene.num_gaussians  # the first `low` may go, the first `high + 1` may not
+        low, high = 0, scene.num_gaussians  # removing the first `low` is allowed, the first `high + 1` is not
         while low < high:
             middle = (low + high + 1) // 2
             within = float(render(_subset(magnitudes, order[:middle])).max()) <= tolerance
@@ -77,7 +77,7 @@ def prune(scene: Scene, tolerance: float = 1e-3, *, cutoff: float = 1e-4, backen
 
 
 def _prune_batch(scene: Scene, tolerance: float, render: RegionSplatRenderer) -> PruneResult:
-    """Do the same for all images at once."""
+    """Prune all images of a batch at once: see `prune`."""
     colors, regions, ids = scene.field.merged_colors().detach(), scene.regions, scene.field.region_ids
     had_color = (colors != 0).any(-1)
     if regions is not None and ids is not None:
@@ -113,7 +113,7 @@ def _recolor(scene: Scene, colors: Tensor) -> Scene:
 @torch.inference_mode(False)
 @torch.enable_grad()
 def _effects(scene: Scene, render: RegionSplatRenderer) -> Tensor:
-    """Bound each Gaussian's effect on a value, by its colour and by the sum of all that it paints, (..., N)."""
+    """Return a bound of each Gaussian's effect: its largest colour value times its summed weights, at most 1."""
     colors = scene.field.merged_colors().detach().clone()
     probe = _recolor(scene, torch.ones_like(colors))
     probe.field.means.requires_grad_(False)

@@ -24,7 +24,7 @@ from kcgs.scene import Scene
 FORMAT = "kcgs.scene"
 """Name of the one metadata entry, a JSON object."""
 VERSION = 1
-MAX_SIDE = 1 << 20  # pixels; beyond, float32 centres cannot tell tenths of a pixel apart
+MAX_SIDE = 1 << 20  # pixels; on longer sides float32 centres cannot resolve tenths of a pixel
 _REQUIRED = ("means", "cholesky", "colors")
 _OPTIONAL = ("opacities", "region_ids", "labels")
 _FLOATS = (torch.float32, torch.float64)
@@ -41,7 +41,7 @@ def serialize(scene: Scene) -> bytes:
     header: dict[str, Any] = {"version": VERSION, "kcgs_version": __version__, "size": scene.size}
     header["notes"] = scene.metadata
     tensors = {
-        # a copy, since safetensors refuses tensors that are views of one storage
+        # copy: safetensors refuses tensors that share a storage
         name: tensor.detach().cpu().clone(memory_format=torch.contiguous_format)
         for name in (*_REQUIRED, "opacities")
         if (tensor := getattr(field, name)) is not None
@@ -59,7 +59,7 @@ def serialize(scene: Scene) -> bytes:
 
 
 def deserialize(data: bytes) -> Scene:
-    """Read the bytes of a .safetensors file; ValueError if they are damaged or no scene."""
+    """Read the bytes of a .safetensors file; raise ValueError if they are damaged or no scene."""
     try:
         tensors = safetensors.torch.load(data)
         notes = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__", {})
@@ -73,9 +73,9 @@ def deserialize(data: bytes) -> Scene:
 
 
 class MappedScene:
-    """A batch of scenes in a .safetensors file whose tensors are mapped into memory, and read where they are used.
+    """A batch of scenes in a .safetensors file; its tensors are mapped into memory and read on use.
 
-    The checksum is not compared, which would read all of it: `deserialize` does.
+    The checksum is not verified, since this would read the whole file; `deserialize` verifies it.
     """
 
     def __init__(self, tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
@@ -86,13 +86,13 @@ class MappedScene:
 
     @property
     def layout(self) -> str:
-        """What all shards of a data set have in common, in words."""
+        """The properties that all shards of a data set must share, in words."""
         _, rows, channels = self.tensors["colors"].shape
         return f"{rows} rows, {channels} channels, {'' if 'region_ids' in self.tensors else 'no '}regions"
 
     @cached_property
     def _regions(self) -> RegionMap | None:
-        """The label maps, which are compressed as one: all are read at once."""
+        """The label maps; they are compressed together, so all are read at once."""
         if "labels" not in self.tensors:
             return None
         labels = _inflate(self.tensors["labels"], **self._header["labels"])
@@ -108,7 +108,7 @@ class MappedScene:
 
 
 def map_file(path: str | os.PathLike[str]) -> MappedScene:
-    """Map a batch of scenes in a .safetensors file into memory; ValueError if it is none."""
+    """Map a batch of scenes in a .safetensors file into memory; raise ValueError if the file has no batch."""
     try:
         with safetensors.safe_open(path, "pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
@@ -131,7 +131,7 @@ def _assemble(tensors: dict[str, Tensor], header: Any) -> Scene:
         allowed = tuple(_INTEGERS.values()) if name in ("region_ids", "labels") else _FLOATS
         if tensor.dtype not in allowed:
             raise ValueError(f"{name} must have a dtype among {allowed}; got {tensor.dtype}")
-    # an editor may leave it out, and earlier files have none
+    # the checksum is optional: an editor may leave it out, and earlier files have none
     if "checksum" in header and header.pop("checksum") != _checksum(tensors, header):
         raise ValueError("its checksum is wrong: the file is damaged, or was edited and keeps the old checksum")
     height, width = header["size"]
@@ -163,7 +163,7 @@ def _narrow(integers: Tensor) -> Tensor:
 
 
 def _deflate(labels: np.ndarray[Any, Any]) -> bytes:
-    """Compress the differences of each row from the row above, in the type of the labels, which wraps around."""
+    """Compress the differences of each row from the row above; they wrap around in the dtype of the labels."""
     steps = np.diff(labels, axis=-2, prepend=np.zeros_like(labels[..., :1, :]))
     return zlib.compress(steps.tobytes(), 9)
 

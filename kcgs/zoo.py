@@ -13,14 +13,14 @@ from kcgs._repr import brief
 __all__ = ["Entry", "entries", "find", "locate"]
 
 _PACKAGE = Path(__file__).resolve().parent
-# within the package in a wheel, beside it in a checkout
+# the folder of scenes: inside the package in a wheel, beside the package in a checkout
 _FOLDER = _PACKAGE / "models" if (_PACKAGE / "models").is_dir() else _PACKAGE.parent / "models"
 _PREFIX = "zoo:"
 
 
 @brief
 class Entry(NamedTuple):
-    """A scene of the zoo, as the manifest describes it."""
+    """The entry of a scene in the zoo's manifest."""
 
     name: str
     title: str
@@ -48,7 +48,7 @@ def entries(folder: Path | None = None) -> list[Entry]:
 
 
 def find(name: str, folder: Path | None = None) -> Path:
-    """Return the file of a scene, its hash checked; the name may begin with "zoo:"."""
+    """Return the path of a scene's file after checking its hash; the name may begin with "zoo:"."""
     by_name = {entry.name: entry for entry in entries(folder)}
     entry = by_name.get(name.removeprefix(_PREFIX))
     if entry is None:
@@ -60,5 +60,5 @@ def find(name: str, folder: Path | None = None) -> Path:
 
 
 def locate(path: str | os.PathLike[str]) -> Path:
-    """Return the path of a scene: "zoo:NAME" is one of the zoo, anything else is a path as it is."""
+    """Return the path of a scene; "zoo:NAME" is a scene of the zoo, any other string is a path."""
     return find(str(path)) if str(path).startswith(_PREFIX) else Path(path)

@@ -11,9 +11,9 @@ from kcgs.errors import InvalidArgument, InvalidArgumentType
 
 
 class CommandGroup(TyperGroup):
-    """Commands that report an argument which the library refuses as an option with a wrong value.
+    """A group of commands that reports an argument refused by the library as an option with a wrong value.
 
-    An option that a command does not have is reported with the commands that have it, unless a similar one is meant.
+    The error for an unknown option lists the commands that have it, unless the command has a similar option.
     """
 
     def invoke(self, context: Any) -> Any:
@@ -35,7 +35,7 @@ class CommandGroup(TyperGroup):
             raise
 
     def _name_owners(self, error: Any) -> None:
-        """Add the commands that have an option to the error that says that one has not."""
+        """Add to the error for an unknown option the commands that have this option."""
         owners = [
             f"kcgs {name}"
             for name, command in self.commands.items()

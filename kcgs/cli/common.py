@@ -1,4 +1,4 @@
-"""What the commands share: arguments, reports, Ctrl-C."""
+"""Shared parts of the commands: arguments, reports, Ctrl-C."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from kcgs._atomic import check_writable
 from kcgs._suffixes import LABEL_MAPS, SCENES
 from kcgs.errors import InvalidArgument
 
-# exit status of a program that Ctrl-C ended
+# exit status of a command that Ctrl-C ended
 INTERRUPTED = 130
 
 
@@ -60,8 +60,8 @@ Json = Annotated[
 
 
 def check_output(path: Path, *suffixes: str, name: str = "output") -> None:
-    """Refuse an output that cannot be written, before the work."""
-    # scenes are written by their exact suffix, images in any case
+    """Refuse an output that cannot be written, before the work starts."""
+    # suffixes of scenes are case-sensitive, suffixes of images are not
     suffix = path.suffix.lower() if path.suffix.lower() in LABEL_MAPS else path.suffix
     if suffix not in suffixes:
         raise InvalidArgument(name, " or ".join(suffixes), repr(str(path)), verb="end in")
@@ -69,18 +69,18 @@ def check_output(path: Path, *suffixes: str, name: str = "output") -> None:
 
 
 def check_new(path: Path, overwrite: bool) -> None:
-    """Refuse an output that exists, before the work, unless it may be replaced."""
+    """Refuse an output that exists, before the work starts, unless it may be replaced."""
     if path.exists() and not overwrite:
         raise FileExistsError(f"{path} exists; --overwrite replaces it")
 
 
 def replace_undefined(report: dict[str, Any]) -> dict[str, Any]:
-    """Replace numbers that JSON does not have by None."""
+    """Replace NaN and infinity by None: JSON has no such numbers."""
     return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in report.items()}
 
 
 def _explain_undefined(name: str) -> str:
-    """Say why a metric of `evaluate` is not defined."""
+    """Return the reason why a metric of `evaluate` is not defined."""
     from kcgs.functional import METRICS
 
     return f"not defined: {METRICS[name].undefined}" if name in METRICS else "not defined"
@@ -110,10 +110,10 @@ def describe_error(error: Exception) -> str:
 
 
 class InterruptHandler:
-    """Ctrl-C in a `with` block stops a fit, which is then saved; a second one ends the command."""
+    """In a `with` block, the first Ctrl-C stops a fit, which is then saved; the second ends the command."""
 
     count = 0
-    """Of Ctrl-C in the block."""
+    """Number of Ctrl-C in the block."""
 
     def __enter__(self) -> InterruptHandler:
         self._outer_handler = signal.signal(signal.SIGINT, self._interrupt)
@@ -128,11 +128,11 @@ class InterruptHandler:
             raise KeyboardInterrupt
 
     def on_step(self, iteration: int, entry: Any) -> bool:
-        """Return whether the fit is to stop; `on_step` of :func:`kcgs.fit`."""
+        """Return whether the fit must stop: the argument `on_step` of :func:`kcgs.fit`."""
         return self.count > 0
 
 
 def exit_interrupted(result: str) -> typer.Exit:
-    """Print what was saved after Ctrl-C, and return what ends the command."""
+    """Print what was saved after Ctrl-C, and return the exception that ends the command."""
     typer.echo(f"kcgs: interrupted: saved {result}", err=True)
     return typer.Exit(INTERRUPTED)

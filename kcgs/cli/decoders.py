@@ -1,4 +1,4 @@
-"""Commands that show scenes elsewhere: export, view; and the list of scenes that come with kcgs, models."""
+"""The commands export and view, which show scenes outside of kcgs, and models, which lists the scenes of the zoo."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def export(
         from kcgs.page import scene_page, web_bytes
 
         exclude("a page", interactive=interactive or None)
-        # a compressed file goes into the page as it is
+        # a compressed file goes into the page unchanged
         data = web_bytes(scene.read_bytes() if scene.suffix == ".kcgs" else loaded)
         size = write_file(output, scene_page(data, title=output.stem))
         print_report({**describe_scene(loaded), "scene_bytes": len(data), "bytes": size}, as_json, str(output))

@@ -1,4 +1,4 @@
-"""The first look: one photo as two files of equal bytes, without and with regions."""
+"""The command demo: one photo as two files of equal size, without and with regions."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def demo(
     from kcgs.fitting import FitConfig, precompile
 
     typer.echo(f"fitting a photo to {TARGET_BYTES:,} bytes twice, without and with regions: about a minute", err=True)
-    precompile(FitConfig.from_recipe("best"))  # the clock counts no compilation
+    precompile(FitConfig.from_recipe("best"))  # so that seconds do not include compilation
     image = torch.from_numpy(astronaut()).permute(2, 0, 1).float() / 255
     compare(output, image, TARGET_BYTES, progress=True)
 
@@ -98,7 +98,7 @@ def compose(panels: Sequence[Panel]) -> Image:
 
 
 def draw_column(panel: Panel) -> Image:
-    """Write a title and two lines above a square image, and two framed close-ups of it below; pixels stay hard."""
+    """Write a title and two lines above a square image, and two framed close-ups below it; pixels are not smoothed."""
     from PIL import Image, ImageDraw, ImageFont
 
     from kcgs.plots import COLORS

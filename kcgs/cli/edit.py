@@ -81,7 +81,7 @@ def edit(
 
 
 def _set_options(**options: object) -> dict[str, Any]:
-    """Return the options that have a value; the others keep the default of the function."""
+    """Return the options that have a value; for the others the function's defaults hold."""
     return {name: value for name, value in options.items() if value is not None}
 
 
@@ -103,7 +103,7 @@ def _parse_move(text: str) -> tuple[int, tuple[float, float]]:
 
 
 def _apply(option: str, function: Callable[..., Scene], *arguments: object, **settings: object) -> Scene:
-    """Edit a scene; an error of an edit's argument is one of the option."""
+    """Edit a scene; report an error of an edit's argument as an error of the option."""
     try:
         return function(*arguments, **settings)
     except InvalidArgument as error:

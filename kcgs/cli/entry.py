@@ -1,4 +1,4 @@
-"""The entry point: set up the process, run a command, turn an error into a line and an exit status."""
+"""The entry point: set up the process, run a command, report an error in one line and an exit status."""
 
 import logging
 import os
@@ -15,8 +15,7 @@ from .common import describe_error
 
 def main() -> None:
     """Run a command: exit status 0 done, 1 failed with one line that says why, 2 wrong usage or a missing file."""
-    # torch reads it when it is loaded, which is later: its threads sleep while they wait, and take no core from
-    # other programs
+    # torch reads this when it is loaded, later: waiting threads then sleep, and take no core from other programs
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     logging.basicConfig(format="%(message)s")
     logging.getLogger("kcgs").setLevel(logging.INFO)

@@ -1,4 +1,4 @@
-"""The command that fits an image, and what it shares with the one that fits many."""
+"""The command fit, and functions that it shares with fit-many."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from kcgs.fitting import FitConfig, FitResult
     from kcgs.scene import Scene
 
-# dB by which a fit exceeds a target, for the rounding to a file to lose
+# dB by which a fit must exceed a target, since rounding to a file loses them
 _ROUNDING_MARGIN = 0.15
 
 
@@ -90,10 +90,10 @@ class SavedFit(NamedTuple):
 
     result: FitResult
     scene: Scene
-    """As a reader of the file has it: rounded, if the file is compressed."""
+    """The scene that the file holds: rounded, if the file is compressed."""
     num_bytes: int
     seconds: float
-    """Of the fit and the writing of the file."""
+    """Wall time of the fit and of writing the file."""
 
 
 def fit_and_save(
@@ -123,11 +123,11 @@ def fit_and_save(
 
 
 def config_for(output: Path, request: options.FitRequest) -> FitConfig:
-    """Return the settings of a fit whose scene goes to a file: a compressed one loses some of a target."""
+    """Return the settings of a fit for a file; a compressed file needs a higher target, since rounding lowers PSNR."""
     config = request.load_config()
     if output.suffix != ".kcgs" or request.target_bytes is not None:
         return config
-    objective_for("file of a PSNR", config.objective)  # refuses what the file cannot lower, before the fit
+    objective_for("file of a PSNR", config.objective)  # refuses an objective that compression lacks, before the fit
     if config.target_psnr is None:
         return config
     return config.model_copy(update={"target_psnr": config.target_psnr + _ROUNDING_MARGIN})
@@ -136,7 +136,7 @@ def config_for(output: Path, request: options.FitRequest) -> FitConfig:
 def save_result(
     output: Path, image: Tensor, result: FitResult, request: options.FitRequest, *, progress: bool = False
 ) -> tuple[Scene, int]:
-    """Write the scene of a fit of one image, by the suffix of `output`; return it as a reader has it, and the bytes."""
+    """Write the scene of a fit of one image, by the suffix of `output`; return the file's scene and size in bytes."""
     from kcgs import Scene, load
 
     scene, config = Scene(result.scene.field, result.scene.regions, {"recipe": request.recipe}), request.load_config()
@@ -153,7 +153,7 @@ def save_result(
 def read_regions(
     regions: str, image: Tensor, threshold: float | None = None, *, resize: bool = False, progress: bool = False
 ) -> Tensor | None:
-    """Return the label map that the option --regions names, with `resize` at the size of the image; None: none."""
+    """Return the label map of the option --regions, or None; `resize`: at the size of the image."""
     if regions in ("auto", "none"):
         options.exclude(f"--regions {regions}", threshold=threshold)
     if regions == "none":
@@ -181,7 +181,7 @@ def read_regions(
 def report_fit(
     saved_fit: SavedFit, image: Tensor, labels: Tensor | None, output: Path, request: options.FitRequest
 ) -> dict[str, Any]:
-    """Return the metrics of the file, those of contours along `labels`, and how the fit ended."""
+    """Return the metrics of the file (EF metrics along the contours of `labels`), and how the fit ended."""
     from kcgs.evaluation import evaluate
 
     with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # the table says it
@@ -204,6 +204,6 @@ def describe_scene(scene: Scene) -> dict[str, int]:
 
 
 def describe_file(path: Path, num_bytes: int, size: tuple[int, int]) -> dict[str, float | None]:
-    """Return the bytes of a file and, of a compressed one, its bits per pixel."""
+    """Return the size of a file in bytes, and the bits per pixel of a compressed file."""
     rate = 8 * num_bytes / (size[0] * size[1]) if path.suffix == ".kcgs" else None
     return {"bytes": num_bytes, "bits_per_pixel": rate}

@@ -1,4 +1,4 @@
-"""The command that fits many images, and its table."""
+"""The command fit-many, and its table of results."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from .many_shards import Shards
 
 
 def _check_batch(value: str) -> str:
-    """Refuse what is neither auto nor a number of images."""
+    """Validate --batch: auto or a number of images."""
     if value != "auto" and not (value.isdigit() and int(value) > 0):
         raise InvalidArgument("batch", "auto, or a number of images", repr(value))
     return value
@@ -112,7 +112,7 @@ def fit_many_command(
     devices = _list_devices(request) if engine == "local" else [request.device]
     on_gpu = devices[0].startswith("cuda")
     if workers is None and engine == "local":
-        # two processes per GPU: one reads and writes while the other one's images are fitted
+        # two processes per GPU: one reads and writes files while the other fits
         workers = 2 * len(devices) if on_gpu else max(1, _count_cores() // threads)
     batches = make_batches(jobs, "1" if single else batch, shard, workers or 1, devices, output)
     workers = None if workers is None else min(workers, len(batches))
@@ -130,13 +130,13 @@ def fit_many_command(
                 progress.update(len(outcomes) / len(jobs), f"{len(outcomes)} of {len(jobs)}")
                 shards.add(batches[number].work, results)
     except KeyboardInterrupt:
-        # a worker may have written a file of which the main process did not hear
+        # a worker may have written a file without the main process knowing
         done = f"{sum(batch.work.count_done() for batch in batches)} of {len(jobs)} images are done"
         typer.echo(f"kcgs: interrupted: {done}; the same command goes on where it stopped", err=True)
         raise typer.Exit(INTERRUPTED) from None
     finally:
         rows = [{"image": str(jobs[index].image), **outcomes[index].row} for index in sorted(outcomes)]
-        if any("error" not in row for row in rows):  # where all were refused, the table of the scenes there stays
+        if any("error" not in row for row in rows):  # if all images failed, an older table stays
             _write_table(output / "results.csv", rows)
     failures = [row for row in rows if "error" in row]
     misses = [row for row in rows if row.get("target_reached") is False]
@@ -158,7 +158,7 @@ def fit_many_command(
 def _find_images(paths: list[Path], regions: str) -> list[tuple[str, Path, str]]:
     """Return each image's stem, its path and its regions: auto, none or a path.
 
-    Paths are absolute, for a worker on a cluster has a working folder of its own.
+    Paths are absolute, since a worker on a cluster has its own working folder.
     """
     images = _by_stem("images", (image for path in paths for image in _list_images(path)))
     if regions in ("auto", "none"):
@@ -172,7 +172,7 @@ def _find_images(paths: list[Path], regions: str) -> list[tuple[str, Path, str]]
 
 def _list_images(path: Path) -> list[Path]:
     if not path.is_dir():
-        path.stat()  # an error, where nothing is there
+        path.stat()  # raises FileNotFoundError
         return [path]
     images = sorted(file for file in path.iterdir() if file.suffix.lower() in IMAGES)
     if not images:
@@ -182,7 +182,7 @@ def _list_images(path: Path) -> list[Path]:
 
 
 def _by_stem(name: str, files: Iterable[Path]) -> dict[str, Path]:
-    """Return files by their stem, after which scenes are named; `name` is that of the parameter."""
+    """Return files by their stem, which names their scenes; `name` is the name of the parameter."""
     by_stem = dict[str, Path]()
     for file in files:
         if by_stem.setdefault(file.stem, file) != file:
@@ -191,7 +191,7 @@ def _by_stem(name: str, files: Iterable[Path]) -> dict[str, Path]:
 
 
 def _list_devices(request: options.FitRequest) -> list[str]:
-    """Return the devices that the option names: "cuda" is all GPUs of the machine."""
+    """Return the devices of the option --device: "cuda" means all GPUs of the machine."""
     if request.device != "cuda":
         return [request.device]
     import torch
@@ -205,7 +205,7 @@ def _count_cores() -> int:
 
 
 def _write_table(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Write a column for each figure of the reports, errors last."""
+    """Write a table with a column for each figure of the reports, errors last."""
     figures = dict.fromkeys(name for row in rows for name in row if name not in ("error", "fingerprint"))
     with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, [*(figures or ["image"]), "error"], extrasaction="ignore")

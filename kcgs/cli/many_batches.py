@@ -1,4 +1,4 @@
-"""The batches of `kcgs fit-many`: images of one size that are fitted together."""
+"""The batches of `kcgs fit-many`: images of the same size that are fitted together."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .many_jobs import FileBatch, FitJob, Outcome
 from .many_shards import ShardPart, fingerprint_of
 from .options import FitRequest
 
-# pixels of a batch: on a core more leave its cache, and a GPU is busy from then on
+# pixels of a batch: more would not fit into the cache of a core; a GPU is fully used from this number on
 _CORE_PIXELS = 1 << 17
 _GPU_PIXELS = 1 << 22
 
@@ -21,17 +21,17 @@ class Batch(NamedTuple):
     """Images that one job fits."""
 
     indices: tuple[int, ...]
-    """Of the images among all of the command."""
+    """Indices of the images among all images of the command."""
     work: FileBatch | ShardPart
 
 
 def run_batch(batch: Batch) -> list[Outcome]:
-    """Fit the images of a batch; the outcomes are in their order."""
+    """Fit the images of a batch; return the outcomes in the order of the images."""
     return batch.work.run()
 
 
 def takes_one_image(request: FitRequest) -> str | None:
-    """Name the option of a request by which images are fitted one by one; None: they may be fitted together."""
+    """Return the option that makes a request fit images one by one; None: images may be fitted together."""
     config = request.load_config()
     values = {
         "target-bytes": request.target_bytes, "target-psnr": config.target_psnr, "max-seconds": config.max_seconds,
@@ -45,11 +45,11 @@ def make_batches(
     """Divide images into batches of one size.
 
     Args:
-        jobs: an image each.
+        jobs: one for each image.
         batch: number of images, or auto.
-        shard: number of scenes of a file; None: a file for each image.
-        workers: batches at a time: none is to be without one.
-        devices: batches take turns on them.
+        shard: number of scenes per file; None: a file for each image.
+        workers: number of batches at a time; with auto there are enough batches for all workers.
+        devices: batches are spread over the devices in turn.
         output: folder of the shards.
     """
     groups = _by_size(jobs) if batch != "1" or shard is not None else {None: [*range(len(jobs))]}
@@ -73,7 +73,7 @@ def make_batches(
 
 
 def _by_size(jobs: Sequence[FitJob]) -> dict[Size | None, list[int]]:
-    """Group images by size, in the order of their first image; those that nobody can read are with the first group."""
+    """Group images by size, in the order of each group's first image; unreadable images join the first group."""
     from kcgs._decode import read_size
 
     groups: dict[Size | None, list[int]] = {}
@@ -87,7 +87,7 @@ def _by_size(jobs: Sequence[FitJob]) -> dict[Size | None, list[int]]:
 
 
 def _auto_batch(size: Size | None, count: int, workers: int, on_gpu: bool) -> int:
-    """Return how many images of a size are fitted together."""
+    """Return the number of images of a size that are fitted together."""
     if size is None:
         return 1
     suitable = (_GPU_PIXELS if on_gpu else _CORE_PIXELS) // (size[0] * size[1])

@@ -22,33 +22,33 @@ if TYPE_CHECKING:
 
 
 class FitJob(NamedTuple):
-    """An image to be fitted, and how."""
+    """An image to be fitted, and the options of its fit."""
 
     image: Path
     output: Path
-    """Of the scene; its row of results.csv is in a JSON file beside it."""
+    """File of the scene; its row of results.csv is in a JSON file beside it."""
     regions: str
-    """auto, none, or the mask."""
+    """auto, none, or the path of the mask."""
     request: FitRequest
     overwrite: bool = False
-    """Replace a scene of another image, mask or settings, or one that was changed since."""
+    """Replace a scene that has another image, mask or settings, or that was changed since."""
     resize_regions: bool = False
     threshold: float | None = None
-    """Of masks with soft edges."""
+    """Threshold of masks with soft edges."""
 
 
 class Outcome(NamedTuple):
     """The result of a job."""
 
     row: dict[str, Any]
-    """Of results.csv; its error alone, where the job failed."""
+    """Row of results.csv; only the error if the job failed."""
     is_new: bool
-    """False: the scene was there from the same image, mask and settings."""
+    """False: the scene already existed, from the same image, mask and settings."""
     warnings: tuple[str, ...] = ()
 
 
 class Loaded(NamedTuple):
-    """An image and its label map, and what was said when they were read."""
+    """An image, its label map, and the warnings while they were read."""
 
     image: Tensor
     labels: Tensor | None
@@ -60,7 +60,7 @@ class BatchFit(NamedTuple):
 
     result: FitResult
     seconds: float
-    """The share of the image in the time of the batch."""
+    """The time of the batch, divided by its number of images."""
     warnings: tuple[str, ...]
 
 
@@ -70,17 +70,17 @@ class FileBatch(NamedTuple):
     images: tuple[FitJob, ...]
 
     def run(self) -> list[Outcome]:
-        """Fit the images, unless their scenes are there."""
+        """Fit the images whose scenes do not exist."""
         return fit_jobs(self.images)
 
     def count_done(self) -> int:
-        """Count the images whose scenes are there, from the same image, mask and settings, with their rows."""
+        """Count the images whose scenes and rows exist, from the same image, mask and settings."""
         return sum(map(_is_done, self.images))
 
 
 def load_job(job: FitJob) -> Loaded:
     """Read the image of a job and its regions."""
-    # a warning of one image among many must say which image: the caller does
+    # among many images a warning must name its image: the caller adds the name
     with warnings.catch_warnings(record=True) as messages:
         warnings.simplefilter("always", UserWarning)
         image = job.request.load_image(job.image)
@@ -98,7 +98,7 @@ def fit_batch(loaded: Sequence[Loaded], request: FitRequest) -> list[BatchFit]:
     images = torch.stack([one.image for one in loaded]).to(device)
     maps = [one.labels for one in loaded if one.labels is not None]
     labels = torch.stack(maps).to(device) if maps else None
-    with warnings.catch_warnings(action="ignore", category=UserWarning):  # which speak of the batch: see _warnings_of
+    with warnings.catch_warnings(action="ignore", category=UserWarning):  # of the batch; for images: _warnings_of
         result = fit(images, labels, request.num_gaussians, recipe=request.load_config(), seed=request.seed)
     seconds = result.seconds / len(loaded)
     parts = [result.of_image(k) for k in range(len(loaded))]
@@ -107,7 +107,7 @@ def fit_batch(loaded: Sequence[Loaded], request: FitRequest) -> list[BatchFit]:
 
 
 def _warnings_of(result: FitResult, count: int) -> tuple[str, ...]:
-    """Say of one image of a batch what its fit alone would have warned of."""
+    """Return the warnings that a fit of this image alone would give."""
     from kcgs.fitting import describe_excess
 
     messages = ["the fit diverged: the best so far is kept"] if result.diverged else []
@@ -118,9 +118,9 @@ def _warnings_of(result: FitResult, count: int) -> tuple[str, ...]:
 
 
 def fit_jobs(jobs: Sequence[FitJob]) -> list[Outcome]:
-    """Fit images, those of one shape together; write a scene and a row of each, unless they are there unchanged.
+    """Fit images, those of the same shape together; write the scene and the row of each, unless both exist unchanged.
 
-    An error of an image is returned, and stops no other.
+    An error of one image is returned; it does not stop the other images.
     """
     outcomes: dict[int, Outcome] = {}
     groups: dict[Any, dict[int, tuple[Loaded, str]]] = {}
@@ -131,7 +131,7 @@ def fit_jobs(jobs: Sequence[FitJob]) -> list[Outcome]:
                 outcomes[index] = Outcome(kept, False)
                 continue
             loaded = load_job(job)
-            # a command that is killed between scene and row knows the scene as its own when it is run again
+            # if the command is killed between scene and row, the next run recognizes the scene as its own
             write_file(job.output.with_suffix(".json"), json.dumps({"fingerprint": fingerprint}))
             groups.setdefault((loaded.image.shape, loaded.labels is None), {})[index] = loaded, fingerprint
         except Exception as error:
@@ -142,13 +142,13 @@ def fit_jobs(jobs: Sequence[FitJob]) -> list[Outcome]:
 
 
 def _fit_group(jobs: Sequence[FitJob], group: dict[int, tuple[Loaded, str]]) -> dict[int, Outcome]:
-    """Fit images of one shape; where they cannot be fitted together, one by one."""
+    """Fit images of the same shape together; if that fails, fit them one by one."""
     fits: dict[int, BatchFit] = {}
     if len(group) > 1:
         try:
             request = jobs[min(group)].request
             fits = dict(zip(group, fit_batch([loaded for loaded, _ in group.values()], request), strict=True))
-        except Exception:  # of one image: alone it says which
+        except Exception:  # one by one, the image at fault gives its own error
             fits = {}
     return {
         index: _fit_and_save(jobs[index], loaded, fingerprint, fits.get(index))
@@ -157,7 +157,7 @@ def _fit_group(jobs: Sequence[FitJob], group: dict[int, tuple[Loaded, str]]) -> 
 
 
 def _fit_and_save(job: FitJob, loaded: Loaded, fingerprint: str, fit: BatchFit | None) -> Outcome:
-    """Write the scene and the row of an image, which is fitted unless its fit is given."""
+    """Write the scene and the row of an image; fit the image first if `fit` is None."""
     try:
         with warnings.catch_warnings(record=True) as messages:
             warnings.simplefilter("always", UserWarning)
@@ -187,7 +187,7 @@ def _is_done(job: FitJob) -> bool:
 
 
 def _read_unchanged(job: FitJob, fingerprint: str) -> dict[str, Any] | None:
-    """Return the row of a scene that is there unchanged; refuse one that may not be replaced."""
+    """Return the row of an existing, unchanged scene, else None; without --overwrite, refuse to replace another."""
     if not job.output.is_file():
         return None
     kept = _read_kept(job, fingerprint)
@@ -199,7 +199,7 @@ def _read_unchanged(job: FitJob, fingerprint: str) -> dict[str, Any] | None:
 
 
 def _read_kept(job: FitJob, fingerprint: str) -> dict[str, Any] | None:
-    """Return the row beside a scene that was made from the same and not changed since; None: there is none."""
+    """Return the row beside a scene if its fingerprint and checksum are right, else None."""
     row = _read_row(job.output.with_suffix(".json"))
     checksum = row.pop("checksum", None)
     is_same = row.get("fingerprint") == fingerprint and checksum == _checksum(job.output, row)
@@ -207,7 +207,7 @@ def _read_kept(job: FitJob, fingerprint: str) -> dict[str, Any] | None:
 
 
 def _read_row(record: Path) -> dict[str, Any]:
-    """Read the row beside a scene; it is empty if there is none that can be read."""
+    """Read the row beside a scene; return an empty row if there is no readable one."""
     try:
         row = json.loads(record.read_bytes())
     except (FileNotFoundError, ValueError):
@@ -227,7 +227,7 @@ def _fingerprint(job: FitJob) -> str:
 
 
 def describe_settings(job: FitJob) -> str:
-    """Return all that a scene depends on besides the image and the mask."""
+    """Return all settings that a scene depends on, besides the image and the mask, as text."""
     request = job.request
     settings: tuple[Any, ...] = (
         request.load_config().model_dump_json(), request.num_gaussians, request.target_bytes, request.seed,

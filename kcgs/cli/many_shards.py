@@ -1,4 +1,4 @@
-"""The job that `kcgs fit-many --shard` runs for a batch of images: a part of a shard; and shards from their parts."""
+"""The job of `kcgs fit-many --shard` for a batch of images, which makes a part of a shard; and shards from parts."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from .many_jobs import FileBatch, FitJob, Loaded, Outcome, describe_settings, fi
 
 
 class ShardPart(NamedTuple):
-    """Images that are fitted together, and where their scenes go until the shard is complete."""
+    """Images that are fitted together, and the place of their scenes until the shard is complete."""
 
     shard: Path
     number: int
-    """Of the part in the shard."""
+    """Number of the part in the shard."""
     images: tuple[FitJob, ...]
     size: tuple[int, int] | None
-    """(height, width) of all of them, as far as their files say it."""
+    """(height, width) of all images; None: their files could not be read."""
     fingerprint: str
-    """Of the whole shard."""
+    """Fingerprint of the whole shard."""
 
     @property
     def path(self) -> Path:
@@ -35,11 +35,11 @@ class ShardPart(NamedTuple):
 
     @property
     def own_fingerprint(self) -> str:
-        """That of the file of the part: another size of batches makes other parts of the same shard."""
+        """Fingerprint of the part's file: with another batch size, the same shard has other parts."""
         return _hash((self.fingerprint, [job.image.name for job in self.images]))
 
     def run(self) -> list[Outcome]:
-        """Fit the images, and write their scenes, unless they are in the shard or in the file of the part."""
+        """Fit the images and write their scenes, unless these are in the shard or in the part's file."""
         kept = _read_kept(self, self.shard, self.fingerprint) or _read_kept(self, self.path, self.own_fingerprint)
         return kept or _fit_part(self)
 
@@ -50,7 +50,7 @@ class ShardPart(NamedTuple):
 
 
 class Shards:
-    """The shards of a command, if it writes any: each is written once all its parts are fitted."""
+    """The shards of a command, if any; each shard is written once all its parts are fitted."""
 
     def __init__(self, work: Sequence[FileBatch | ShardPart]) -> None:
         self._parts: dict[Path, list[ShardPart]] = {}
@@ -60,7 +60,7 @@ class Shards:
         self._rows: dict[Path, dict[str, dict[str, Any]]] = {shard: {} for shard in self._parts}
 
     def check(self) -> None:
-        """Refuse shards that are there from other images or with other settings, unless they may be replaced."""
+        """Refuse existing shards of other images or other settings, unless they may be replaced."""
         for shard, (part, *_) in self._parts.items():
             is_kept = shard.is_file() and not part.images[0].overwrite
             if is_kept and _fingerprint_in(shard) != part.fingerprint:
@@ -68,7 +68,7 @@ class Shards:
                 raise FileExistsError(f"{shard} {problem}; --overwrite replaces such shards")
 
     def add(self, part: FileBatch | ShardPart, outcomes: Sequence[Outcome]) -> None:
-        """Count a part as done, and write its shard if it was the last one."""
+        """Count a part as done, and write its shard if this was the last part."""
         if not isinstance(part, ShardPart):
             return
         rows, parts = self._rows[part.shard], self._parts[part.shard]
@@ -110,7 +110,7 @@ def _fit_part(part: ShardPart) -> list[Outcome]:
 
 
 def _fit_and_save(part: ShardPart, loaded: dict[int, Loaded], errors: dict[int, str]) -> dict[int, Outcome]:
-    """Fit images of one shape, and write the part."""
+    """Fit images of the same shape, and write the part."""
     from kcgs.data import save_shard, stack_scenes
     from kcgs.fitting import rank_gaussians
     from kcgs.nn import reorder_rows
@@ -119,7 +119,7 @@ def _fit_and_save(part: ShardPart, loaded: dict[int, Loaded], errors: dict[int, 
     request = part.images[0].request
     try:
         fits = fit_batch([*loaded.values()], request)
-    except Exception as error:  # of all of them: their images and maps were read
+    except Exception as error:  # images and maps were read, so the error is of the whole part
         return {index: Outcome({"error": describe_error(error)}, True) for index in loaded}
     with_maps = part.images[0].regions != "none"
     singles = [fit.result.scene for fit in fits]
@@ -144,7 +144,7 @@ def _fit_and_save(part: ShardPart, loaded: dict[int, Loaded], errors: dict[int, 
 
 
 def _read_kept(part: ShardPart, path: Path, fingerprint: str) -> list[Outcome] | None:
-    """Return the rows of a part that are in a file of the same images and settings; None: it is not there."""
+    """Return the rows of a part from a file of the same images and settings; None: there is no such file."""
     notes = _notes(path)
     if notes.get("fingerprint") != fingerprint:
         return None
@@ -158,7 +158,7 @@ def _fingerprint_in(path: Path) -> str | None:
 
 
 def _notes(path: Path) -> dict[str, str]:
-    """Return the metadata of a shard or a part; empty where it is not there, or none."""
+    """Return the metadata of a shard or a part; empty if the file does not exist or is no shard."""
     from kcgs.storage import map_file
 
     try:
@@ -168,17 +168,17 @@ def _notes(path: Path) -> dict[str, str]:
 
 
 def _complete(parts: Sequence[ShardPart], errors: Mapping[str, str]) -> None:
-    """Write a shard from its parts, unless it is there or no image was fitted, and remove the parts.
+    """Write a shard from its parts, unless it exists or no image was fitted; then remove the parts.
 
     Args:
-        parts: all of the shard.
-        errors: of images that failed, by name.
+        parts: all parts of the shard.
+        errors: messages of images that failed, by name.
     """
     from kcgs.data import save_shard, stack_scenes
     from kcgs.files import load
 
     shard, fingerprint = parts[0].shard, parts[0].fingerprint
-    # a command that was killed while it removed parts left some of them
+    # the shard may exist: an earlier command was perhaps killed while it removed the parts
     is_there = _fingerprint_in(shard) == fingerprint
     scenes = [] if is_there else [load(part.path) for part in parts if part.path.is_file()]
     if scenes:

@@ -1,4 +1,4 @@
-"""Options that several commands have, and the fit that they request."""
+"""Options that several commands share, and the fit that they request."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Threshold = Annotated[
     float | None,
     typer.Option(min=0, help="Of a mask with soft edges: grey level above which a pixel is of the object."),
 ]
-# pixels of the shorter side of an image that --regions auto segments: in smaller ones regions seldom pay
+# least shorter side of an image that --regions auto segments, in pixels: smaller images seldom gain by regions
 LEAST_SIDE = 64
 IF_LARGE = f"if no side is below {LEAST_SIDE} pixels"
 _FILES = PURPOSES["file of a size"]
@@ -47,49 +47,49 @@ class FitRequest(NamedTuple):
     """The options of a fit besides the image and its regions."""
 
     num_gaussians: int | None
-    """None: by the size of the image."""
+    """None: chosen by the size of the image."""
     target_bytes: int | None
-    """Of a `.kcgs` file; the number of Gaussians then follows from it."""
+    """Largest size of a `.kcgs` file; it determines the number of Gaussians."""
     recipe: str
     settings: dict[str, Any]
-    """In place of the recipe's."""
+    """Settings in place of the recipe's."""
     seed: int
     device: str
-    """Where it is fitted."""
+    """Device of the fit."""
     is_grey: bool = False
-    """Fit the luma alone, one channel."""
+    """Fit only the luma, one channel."""
 
     @property
     def default_suffix(self) -> str:
-        """Suffix of the file, where none is given."""
+        """Suffix of the file if no output is given."""
         return ".safetensors" if self.target_bytes is None else ".kcgs"
 
     def count_for(self, height: int, width: int) -> int:
-        """Return the number of Gaussians of an image of a size."""
+        """Return the number of Gaussians for an image of this size."""
         from kcgs.fitting import default_num_gaussians
 
         return self.num_gaussians or default_num_gaussians(height, width)
 
     def load_config(self) -> FitConfig:
-        """Return the recipe with these settings; a ValueError names a wrong one."""
+        """Return the recipe with these settings; raise a ValueError that names a wrong setting."""
         from kcgs.fitting import FitConfig
 
         return FitConfig.from_recipe(self.recipe, **self.settings)
 
     def load_image(self, path: Path) -> Tensor:
-        """Read an image with the channels that are fitted."""
+        """Read an image with the channels of the fit."""
         from kcgs.data import load_image
 
         return load_image(path, channels="L" if self.is_grey else "RGB")
 
     def load_device(self) -> torch.device:
-        """Return the device; a ValueError says that torch has none of that name."""
+        """Return the device; raise a ValueError if torch has no device of this name."""
         import torch
 
         try:
             device = torch.device(self.device)
             torch.empty(0, device=device)
-        except (RuntimeError, AssertionError) as error:  # torch without CUDA asserts
+        except (RuntimeError, AssertionError) as error:  # torch without CUDA raises AssertionError
             raise InvalidArgument("device", "one that torch has, such as cpu or cuda", repr(self.device)) from error
         return device
 
@@ -128,7 +128,7 @@ def fit_request(
     seed: Annotated[int, typer.Option(help="Seed of the random start.")] = 0,
     device: Annotated[str, typer.Option(help="Where to fit: cpu, or cuda for a GPU.")] = "cpu",
 ) -> FitRequest:
-    """Return a request of the options."""
+    """Return the request that the options describe."""
     if target_bytes is not None:
         exclude("--target-bytes", num_gaussians=num_gaussians, target_psnr=target_psnr)
     settings: dict[str, Any] = {
@@ -142,9 +142,9 @@ def fit_request(
 
 
 def with_fit_options(command: Callable[..., None], *, without: tuple[str, ...] = ()) -> Callable[..., None]:
-    """Give a command the options of `fit_request`, less those of `without`, in place of its argument `request`.
+    """Replace a command's argument `request` by the options of `fit_request`, except those in `without`.
 
-    Typer reads options from a function's signature and knows no groups of them, so a signature is put together here.
+    Typer reads options from a function's signature and has no groups of options, so this function builds a signature.
     """
     fit_options = dict(inspect.signature(fit_request, eval_str=True).parameters)
     for name in without:
@@ -163,14 +163,14 @@ def with_fit_options(command: Callable[..., None], *, without: tuple[str, ...] =
 
 
 def exclude(cause: str, **options: object) -> None:
-    """Refuse options that have a value where `cause`, another option or an argument, leaves them no meaning."""
+    """Refuse options that have no meaning together with `cause`, another option or an argument."""
     for name, value in options.items():
         if value is not None:
             raise InvalidArgument(name, f"left out with {cause}", value)
 
 
 def target_size(scene: Scene, scale: float | None, size: str | None) -> tuple[int, int]:
-    """Return the (height, width) that --scale or --size names, if memory has room for it."""
+    """Return the (height, width) of --scale or --size; refuse sizes that do not fit into memory."""
     from kcgs._check import check_number
     from kcgs.scene import check_render_memory
 

@@ -1,4 +1,4 @@
-"""Commands that read a scene: render, eval, info, encode, decode; the last three also take label maps."""
+"""The commands render, eval, info, encode and decode, which read scenes; the last three also take label maps."""
 
 from __future__ import annotations
 
@@ -225,14 +225,14 @@ def decode(
 
 
 def _load_like(scene: Scene, image: Path) -> Tensor:
-    """Read an image with one channel for a scene with one."""
+    """Read an image, with one channel if the scene has one."""
     from kcgs.data import load_image
 
     return load_image(image, channels="L" if scene.field.colors.shape[-1] == 1 else "RGB")
 
 
 def _read_map(file: Path) -> Tensor | None:
-    """Return the label map of a compressed file that holds one."""
+    """Return the label map of a file if it is a compressed label map, else None."""
     from kcgs.codec import MAP_MAGIC, decode_labels
 
     data = file.read_bytes()

@@ -1,4 +1,4 @@
-"""The command that fits a video, and what `kcgs render` does with a batch of scenes."""
+"""The command fit-video, and the part of `kcgs render` that renders a batch of scenes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from .fit import describe_scene, read_regions
 if TYPE_CHECKING:
     from kcgs.scene import Scene
 
-# options of a fit that only make sense for one image
+# options of a fit that make sense only for one image
 _SINGLE_IMAGE_OPTIONS = ("max_seconds", "target_psnr", "target_bytes", "device", "bounded", "grey")
 
 
@@ -93,7 +93,7 @@ def fit_video_command(
 
 
 def _save(scenes: Scene, output: Path) -> int:
-    """Write a batch into a file, or its scenes into a folder as 00000.safetensors and so on; return the bytes."""
+    """Write a batch to a file, or its scenes to a folder as 00000.safetensors and so on; return the size in bytes."""
     if output.suffix:
         return scenes.save(output)
     output.mkdir(parents=True, exist_ok=True)
@@ -103,7 +103,7 @@ def _save(scenes: Scene, output: Path) -> int:
 def render_batch(
     scenes: Scene, output: Path, size: tuple[int, int], frame_rate: float | None, frame: float | None
 ) -> int:
-    """Write a batch as a video, as a folder of PNGs, or one time of it as an image; return the number of images."""
+    """Write a batch as a video or a folder of PNGs, or a single time as an image; return the number of images."""
     from kcgs._check import check_number
     from kcgs.data import save_image
     from kcgs.video import interpolate, write_video

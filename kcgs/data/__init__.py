@@ -7,7 +7,7 @@ from .images import load_image, save_image
 from .labels import load_labels, save_labels
 from .shards import SceneBatch, SceneDataset, save_shard, shard_path, stack_scenes
 
-# public; what else is imported here is for the other rooms of kcgs
+# the public names; other packages of kcgs use the other imports
 __all__ = [
     "ChartSample", "Davis", "DavisFrame", "SceneBatch", "SceneDataset", "chart_2x3", "chart_pie",
     "colorize_labels", "label_colors", "load_image", "load_labels", "overlay_labels",

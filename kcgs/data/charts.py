@@ -28,9 +28,9 @@ _SECTORS = (
 # pixels
 _PIE_SIZE = 300
 _PIE_RADIUS = 130.0
-# half a sector: the first is centred at the top, and no edge runs along a row, a column or a diagonal
+# half a sector, in radians: the first sector is centred at the top, so that no edge is a row, a column or a diagonal
 _PIE_START = torch.pi / 8
-# samples of a pixel on an edge, per side
+# samples per side of a pixel on an edge
 _SUBSAMPLES = 8
 
 
@@ -46,7 +46,7 @@ def chart_2x3(scale: int = 1) -> ChartSample:
     """Make two rows of three flat blocks: red, green, blue over dark green, orange, purple.
 
     Args:
-        scale: how many times the size of 200 rows by 300 columns, at least 1.
+        scale: factor on the size of 200 x 300 pixels (height x width), at least 1.
 
     Returns:
         The chart, (200 scale, 300 scale); labels 0 to 5 in reading order.
@@ -75,8 +75,7 @@ def chart_pie(scale: int = 1) -> ChartSample:
     red, orange, yellow, green, cyan, blue, purple and magenta. A pixel is the mean of 8 x 8 samples.
 
     Args:
-        scale: how many times the size of 300 by 300, as in `chart_2x3`. The shapes are the same: labels at a higher
-            scale are exact contours, not enlarged ones.
+        scale: factor on the size of 300 x 300 pixels, at least 1. At every scale contours are exact, not enlarged.
 
     Returns:
         The chart, (300 scale, 300 scale); label 0 is the background, 1 to 8 the sectors.
@@ -93,7 +92,7 @@ def chart_pie(scale: int = 1) -> ChartSample:
     labels = _pie_region(centers[None, :], centers[:, None], scale)
     palette = torch.tensor([(1.0, 1.0, 1.0), *_SECTORS])
     image = palette[labels]
-    # only pixels that touch another region can be mixed; sampling only them saves time at large scales
+    # only pixels that touch another region can be mixed: the other pixels are not sampled, which saves time
     ids = labels[None].float()
     rows, columns = (F.max_pool2d(ids, 3, 1, 1) != -F.max_pool2d(-ids, 3, 1, 1))[0].nonzero(as_tuple=True)
     offsets = (torch.arange(_SUBSAMPLES, dtype=torch.float64) + 0.5) / _SUBSAMPLES

@@ -1,4 +1,4 @@
-"""Label maps as images to look at."""
+"""Label maps as colour images."""
 
 import math
 from typing import Any
@@ -13,13 +13,13 @@ from kcgs._image import as_image
 from kcgs._labels import check_labels
 from kcgs.maps import interior_points, touching_pairs
 
-# step of the hue, the golden ratio less 1: any run of hues is spread over the circle
+# step of the hue, the golden ratio minus 1: consecutive hues are spread over the circle
 _HUE_STEP = 0.6180339887498949
-# cycles of saturation and value: colours of neighbouring hues differ in them
+# cycles of saturation and value: colours with similar hues differ in these
 _SATURATIONS = (0.85, 0.55, 0.95, 0.40, 0.75)
 _VALUES = (0.95, 0.80, 0.60, 1.00, 0.42)
 
-# the palette of Okabe and Ito, which people with any colour vision tell apart, without black
+# the palette of Okabe and Ito without black: people with any colour vision can tell its colours apart
 _SAFE_COLORS = (
     (0.902, 0.624, 0.0),
     (0.337, 0.706, 0.914),
@@ -31,15 +31,15 @@ _SAFE_COLORS = (
 )
 # share of the colour of a region in an overlay
 _TINT = 0.45
-# height of an id in an overlay, in distances from its place to the contour
+# height of an id in an overlay, as a multiple of the distance from its place to the contour
 _TEXT_SHARE = 1.6
-# least and largest height of an id, in pixels: a smaller one cannot be read, and is left out
+# least and largest height of an id, in pixels; smaller ids cannot be read and are left out
 _MIN_TEXT = 7.0
 _MAX_TEXT = 24.0
 
 
 def label_colors(n: int) -> Tensor:
-    """Return ``n`` colours that are told apart; the first ones do not depend on ``n``.
+    """Return ``n`` distinct colours; the first colours do not depend on ``n``.
 
     Args:
         n: number of colours, at least 0.
@@ -83,15 +83,15 @@ def colorize_labels(labels: Tensor) -> Tensor:
 
 
 def overlay_labels(image: Any, labels: Tensor, *, ids: bool = False) -> Tensor:
-    """Return a label map over its image: the image in grey, every region tinted, contours white between black.
+    """Return a label map over its image: the image in grey, tinted regions, white contours with black outlines.
 
-    The seven colours of Okabe and Ito are told apart with any colour vision. Regions that touch differ in colour,
-    unless seven neighbours have all of them.
+    The tints are the seven colours of Okabe and Ito, which differ for any colour vision. Touching regions differ in
+    colour, unless the neighbours of a region use all seven.
 
     Args:
         image: :math:`(3, H, W)` or :math:`(1, H, W)` floating in [0, 1]; or a numpy array (H, W, C), or a PIL image.
         labels: :math:`(H, W)` integer, any non-negative ids.
-        ids: whether the id of each region is written inside of it, where there is room for it.
+        ids: write the id of each region into the region, if there is room.
 
     Returns:
         :math:`(3, H, W)` float32 RGB in [0, 1], on the CPU.
@@ -125,7 +125,7 @@ def overlay_labels(image: Any, labels: Tensor, *, ids: bool = False) -> Tensor:
 
 
 def _neighbour_colors(regions: Tensor) -> Tensor:
-    """Return the index of a colour for each region: the first that no earlier neighbour has."""
+    """Return the index of a colour for each region: the first colour that no earlier neighbour has."""
     earlier: dict[int, list[int]] = {}
     for low, high in touching_pairs(regions):
         earlier.setdefault(high, []).append(low)
@@ -138,7 +138,7 @@ def _neighbour_colors(regions: Tensor) -> Tensor:
 
 
 def _write_ids(image: Tensor, regions: Tensor, names: list[int]) -> Tensor:
-    """Write the id of each region, white with a black outline, where it is widest."""
+    """Write the id of each region, white with a black outline, where the region is widest."""
     canvas = Image.fromarray((image * 255).round().byte().permute(1, 2, 0).numpy())
     writer = ImageDraw.Draw(canvas)
     points, distances = interior_points(regions)

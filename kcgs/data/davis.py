@@ -27,7 +27,7 @@ class DavisFrame(NamedTuple):
 
 
 class Davis:
-    """A folder of DAVIS at 480p in its official layout, by the names of its sequences.
+    """The sequences of a DAVIS folder at 480p in its official layout, by name.
 
     The layout is ``JPEGImages/480p/SEQUENCE/00000.jpg`` and ``Annotations/480p/SEQUENCE/00000.png``. A sequence has a
     folder in both trees; its files are read on access.
@@ -68,11 +68,11 @@ class Davis:
         return len(self.sequences)
 
     def __iter__(self) -> Iterator[DavisFrame]:
-        """Read one sequence after the other."""
+        """Yield the first frame of one sequence after another."""
         return (self[name] for name in self.sequences)
 
     def __getitem__(self, key: int | str) -> DavisFrame:
-        """Read a frame by the position or the name of its sequence."""
+        """Read the first frame of a sequence, by the position or the name of the sequence."""
         name = self.sequences[key] if isinstance(key, int) else key
         image, labels = self._images / name / "00000.jpg", self._annotations / name / "00000.png"
         return DavisFrame(name, load_image(image), load_labels(labels))

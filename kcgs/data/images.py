@@ -15,7 +15,7 @@ from kcgs._image import as_image, read_image
 from kcgs._suffixes import WRITTEN_IMAGES
 
 _MODES = {1: "L", 3: "RGB", 4: "RGBA"}
-# of Pillow, by format
+# options of Pillow, by format
 _OPTIONS: dict[str, dict[str, object]] = {
     "JPEG": {"quality": 95, "subsampling": 0},
     "WEBP": {"lossless": True, "exact": True},
@@ -29,14 +29,14 @@ def load_image(
 ) -> Tensor:
     """Read an image as a tensor.
 
-    PNG, JPEG, WebP, TIFF, GIF, BMP and other formats of Pillow; of several frames, the first. EXIF orientation is
-    applied. PNG and TIFF with 16 bits per channel keep them; float TIFF must lie in [0, 1]. CMYK becomes RGB by
-    Pillow's plain formula; colour profiles are not applied. "RGB" and "L" compose transparent pixels on white.
+    It reads PNG, JPEG, WebP, TIFF, GIF, BMP and other formats of Pillow, and the first of several frames. EXIF
+    orientation is applied. PNG and TIFF keep 16 bits per channel; float TIFF must be in [0, 1]. CMYK becomes RGB by
+    Pillow's simple formula; colour profiles are not applied. "RGB" and "L" compose transparent pixels on white.
 
     Args:
         path: the file.
-        channels: what to return. "RGB" repeats grey three times; "L" is Rec. 601 luma, 0.299 R + 0.587 G + 0.114 B;
-            "RGBA" adds an alpha of 1 to opaque images.
+        channels: channels of the result. "RGB" repeats grey three times; "L" is Rec. 601 luma, 0.299 R + 0.587 G +
+            0.114 B; "RGBA" adds an alpha of 1 to opaque images.
 
     Returns:
         :math:`(C, H, W)` float32 in [0, 1], C = 3, 1 or 4.
@@ -63,7 +63,7 @@ def load_image(
 
 
 def save_image(path: str | os.PathLike[str], image: Any) -> None:
-    """Write an image with 8 bits per channel, whole or not at all.
+    """Write an image with 8 bits per channel, atomically.
 
     Values are clipped to [0, 1] and rounded to the nearest of 256 levels. The suffix picks the format: .png, .webp,
     .tif, .tiff and .bmp keep the levels exactly, .jpg and .jpeg are quality 95 without chroma subsampling.

@@ -25,10 +25,10 @@ def load_labels(path: str | os.PathLike[str], *, rgb_ids: bool = False, threshol
     - .npy: an integer or boolean array of two dimensions.
 
     Args:
-        path: PNG, TIFF, GIF, BMP or .npy, no format that changes pixel values.
-        rgb_ids: colours are ids, R + 256 G + 65536 B, as in COCO's panoptic maps; any number of them.
-        threshold: of a mask with soft edges: pixels with larger values have label 1, others 0; of colours the luma
-            counts.
+        path: PNG, TIFF, GIF, BMP or .npy; no format that changes pixel values.
+        rgb_ids: colours are ids, R + 256 G + 65536 B, as in COCO's panoptic maps; there may be any number of ids.
+        threshold: for a mask with soft edges: pixels with larger values have label 1, others 0; colours count by their
+            luma.
 
     Returns:
         :math:`(H, W)` int64, non-negative; ids need not be consecutive.
@@ -50,7 +50,7 @@ def load_labels(path: str | os.PathLike[str], *, rgb_ids: bool = False, threshol
 
 
 def save_labels(path: str | os.PathLike[str], labels: Tensor, *, rgb_ids: bool = False) -> None:
-    """Write a label map losslessly, whole or not at all.
+    """Write a label map losslessly and atomically.
 
     A .png is an 8-bit palette image whose index is the label if all ids are below 256, else 16-bit grey.
 
@@ -62,8 +62,8 @@ def save_labels(path: str | os.PathLike[str], labels: Tensor, *, rgb_ids: bool =
     Raises:
         FileNotFoundError: the folder of ``path`` does not exist.
         TypeError: ``labels`` is no integer tensor.
-        ValueError: ``labels`` has another shape, negative ids or ids too large for the format, or the suffix
-            is another.
+        ValueError: ``labels`` has another shape, negative ids or ids too large for the format, or the suffix is
+            unknown.
 
     Example:
         >>> import tempfile

@@ -1,4 +1,4 @@
-"""Shards, which hold the scenes of many images of one size, and a data set over a folder of them."""
+"""Shards, files with the scenes of many images of one size, and a data set over a folder of shards."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from kcgs.nn import GaussianField, pad_rows
 from kcgs.scene import Scene
 from kcgs.storage import MappedScene, map_file
 
-# of the names of shards
+# digits in the names of shards
 _DIGITS = 5
 
 
 @brief
 class SceneBatch(NamedTuple):
-    """Scenes of a data set as tensors; rows that an image has no use for have the colour 0.
+    """Scenes of a data set as tensors; rows that an image does not need have the colour 0.
 
     In shards of `kcgs fit-many` rows are in the order of :func:`kcgs.fitting.rank_gaussians`. Label maps are those of
     ``dataset[k].regions``.
     """
 
     positions: Tensor
-    """Of the scenes in the data set, (B,) int64."""
+    """Indices of the scenes in the data set, (B,) int64."""
     sizes: Tensor
     """(height, width) of the images, (B, 2) int64."""
     means: Tensor
@@ -44,14 +44,14 @@ class SceneBatch(NamedTuple):
     colors: Tensor
     """(B, N, C)"""
     region_ids: Tensor | None
-    """(B, N) int64, where scenes have label maps."""
+    """(B, N) int64 if the scenes have label maps, else None."""
 
     def to(self, device: torch.device | str) -> SceneBatch:
         """Return the batch on another device."""
         return SceneBatch(*(None if table is None else table.to(device) for table in self))  # type: ignore[arg-type]
 
     def tokens(self) -> Tensor:
-        """Write the Gaussians as numbers of order one, (B, N, 5 + C): see :func:`kcgs.functional.to_tokens`."""
+        """Return the Gaussians as numbers of order one, (B, N, 5 + C): see :func:`kcgs.functional.to_tokens`."""
         return to_tokens(self.means, self.cholesky, self.colors, self.sizes)
 
 
@@ -59,11 +59,11 @@ class SceneDataset(Dataset[Scene]):
     r"""The scenes in the shards of a folder, as `kcgs fit-many --shard` writes them: a torch Dataset.
 
     Convention: an index gives a scene, without rows of the colour 0. Batches come as tensors, by torch's
-    ``__getitems__``: pass :meth:`collate` to a DataLoader. Files are mapped into memory, so that only the rows that are
-    asked for are read. A copy in another process, spawned or forked, opens the files itself.
+    ``__getitems__``: pass :meth:`collate` to a DataLoader. Files are mapped into memory, so that only the requested
+    rows are read. A copy in another process, spawned or forked, opens the files itself.
 
     Args:
-        folder: with 00000.safetensors, 00001.safetensors and so on; all of as many rows and channels.
+        folder: has 00000.safetensors, 00001.safetensors and so on, all with the same numbers of rows and channels.
 
     Raises:
         FileNotFoundError: no shards there.
@@ -83,9 +83,9 @@ class SceneDataset(Dataset[Scene]):
     """
 
     names: list[str]
-    """Of the images, in order."""
+    """Names of the images, in the order of the scenes."""
     psnr: Tensor
-    """Of each scene, in dB, (K,) float64."""
+    """PSNR of each scene, in dB, (K,) float64."""
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self._paths = list_shards(folder)
@@ -139,7 +139,7 @@ class SceneDataset(Dataset[Scene]):
 
     @staticmethod
     def collate(batch: SceneBatch) -> SceneBatch:
-        """Return a batch as it is: the argument `collate_fn` of a DataLoader."""
+        """Return the batch unchanged: pass it as `collate_fn` to a DataLoader."""
         return batch
 
     def __getstate__(self) -> dict[str, Any]:
@@ -174,17 +174,17 @@ def save_shard(
     psnr: Sequence[float] | Tensor,
     metadata: Mapping[str, str] | None = None,
 ) -> int:
-    """Write a batch of scenes as a shard, with the names and the PSNR of its images; return the bytes.
+    """Write a batch of scenes as a shard, with the names and PSNR of its images; return the file's size in bytes.
 
     Args:
         path: 00000.safetensors, 00001.safetensors and so on.
         scenes: of images of one size.
         names: of the images.
-        psnr: of the scenes, in dB, such as that of :class:`kcgs.FitResult`.
-        metadata: more notes, for the file.
+        psnr: of the scenes, in dB, such as `psnr` of :class:`kcgs.FitResult`.
+        metadata: more notes for the file.
 
     Raises:
-        ValueError: another name; not as many names or numbers as scenes.
+        ValueError: `path` has no name of a shard; the number of names or PSNRs is not that of the scenes.
 
     Example:
         >>> import tempfile
@@ -199,7 +199,7 @@ def save_shard(
     for name, values in (("names", names), ("psnr", numbers)):
         if len(values) != len(scenes):
             raise InvalidArgument(name, f"one for each of {len(scenes)} scenes", len(values))
-    # JSON has no infinity, which the PSNR of an image without error is
+    # JSON has no infinity, the PSNR of an image without error
     finite = [number if math.isfinite(number) else None for number in numbers]
     notes = {**(metadata or {}), "names": json.dumps([*names]), "psnr": json.dumps(finite)}
     return Scene(scenes.field, scenes.regions, notes).save(path)
@@ -215,9 +215,9 @@ def shard_contents(metadata: Mapping[str, str], path: Path) -> tuple[list[str], 
 
 
 def stack_scenes(scenes: Sequence[Scene], num_gaussians: int, *, with_maps: bool) -> Scene:
-    """Put scenes of one image each, all of one size, into a batch of so many rows each, without opacities.
+    """Stack unbatched scenes of one size into a batch of `num_gaussians` rows each, without opacities.
 
-    `with_maps`: a scene without a label map gets one of one region.
+    `with_maps`: a scene without a label map gets a map of one region.
     """
     if not with_maps:
         return Scene(GaussianField.stack([pad_rows(scene.field, num_gaussians) for scene in scenes]))

@@ -1,4 +1,4 @@
-"""Videos as batches of scenes: read, fit, follow, edit, interpolate, write."""
+"""Videos as batches of scenes: read, fit, edit, interpolate and write them."""
 
 from .editing import delete_from_video, move_in_video
 from .files import Frames, read_label_maps, read_video, write_video

@@ -1,4 +1,4 @@
-"""The background that a region hides in one frame of a video and others show."""
+"""Restore the background that a region hides in one frame of a video from frames that show it."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from kcgs.maps import nearest_labels
 
 from .flow import sample
 
-# pixels around a region that still have colours of it, since edges in photos are blurred: they are filled, too
+# width of the rim around a region that is filled too, in pixels: edges in photos are blurred
 _FRINGE = 3
-# pixels between a Gaussian and where a motion puts it, up to which it follows the motion
+# a Gaussian follows a motion if it is at most this far from the place that the motion predicts, in pixels
 _MAX_RESIDUAL = 1.0
-# samples of three rows: with more, the motion of most rows is found more surely
+# samples of three rows; with more samples the motion of most rows is found more reliably
 _RANSAC_TRIALS = 200
-# rows that determine a motion reliably
+# least number of rows that determine a motion reliably
 _MIN_ROWS = 12
 
 
 def affine_motions(means: Tensor, background: Tensor) -> Tensor:
-    """Return the affine motion (T, 3, 3) from the first frame to each that most rows of the background (T, N) have.
+    """Return the affine motions (T, 3, 3) from the first frame to each frame, of most rows of `background` (T, N).
 
-    Optical flow, which the fit follows, ends where a region hides the background; an affine motion goes on behind it.
+    The fit follows optical flow, which ends where a region hides the background; an affine motion goes on behind it.
     """
     from skimage.measure import ransac
     from skimage.transform import AffineTransform
@@ -45,16 +45,16 @@ def affine_motions(means: Tensor, background: Tensor) -> Tensor:
 
 
 def restore_background(renders: Tensor, labels: Tensor, deleted: Tensor, motions: Tensor) -> tuple[Tensor, Tensor]:
-    """Fill pixels of all frames from the nearest frame that shows them; `inpaint` fills those that none shows.
+    """Fill deleted pixels of each frame from the nearest frame that shows them; `inpaint` fills the rest.
 
     Args:
         renders: (T, C, H, W).
         labels: (T, H, W).
-        deleted: the pixels, bool (T, H, W); those around them are filled, too, but keep their labels.
-        motions: affine, from the first frame to each, (T, 3, 3).
+        deleted: mask of the pixels to fill, bool (T, H, W); a rim around them is filled too, but keeps its labels.
+        motions: affine, from the first frame to each frame, (T, 3, 3).
 
     Returns:
-        The images and the labels.
+        The new images and the new labels.
     """
     holes = [dilate(mask, _FRINGE) for mask in deleted]
     originals = [_Pixels(*pixels) for pixels in zip(renders, labels, holes, strict=True)]
@@ -63,7 +63,7 @@ def restore_background(renders: Tensor, labels: Tensor, deleted: Tensor, motions
         pixels = _Pixels(*(plane.clone() for plane in original))
         nearest = sorted(range(len(originals)), key=lambda s: abs(s - t))[1:]
         sources = [(s, originals[s]) for s in nearest]
-        if t:  # pixels that no frame shows continue those of the frame before
+        if t:  # pixels that no frame shows are copied from the filled frame before
             sources.append((t - 1, results[-1]))
         for s, source in sources:
             if pixels.unknown.any():
@@ -85,7 +85,7 @@ class _Pixels(NamedTuple):
 
 
 def _copy(source: _Pixels, target: _Pixels, motion: Tensor) -> None:
-    """Fill unknown pixels of the target, in place, from where a motion puts them in the source, if known there."""
+    """Fill unknown pixels of the target, in place, from their places in the source by a motion, if known there."""
     y, x = target.unknown.nonzero().T
     points = apply_affine(motion, torch.stack([x, y], -1).to(target.image) + 0.5)
     cols, rows = points.floor().long().unbind(-1)

@@ -1,4 +1,4 @@
-"""The descent of a frame from Gaussians that are nearly right, in which a row stays the same Gaussian."""
+"""The descent of a video frame from Gaussians of the frame before; a row stays the same Gaussian."""
 
 from __future__ import annotations
 
@@ -24,42 +24,42 @@ from kcgs.optim import (
 )
 from kcgs.scene import Scene
 
-# Numbers are tuned: more iterations and relocations lower the error, and take longer and flicker more.
+# These numbers are tuned: more iterations and relocations lower the error, but take longer and flicker more.
 
-# of each frame
+# iterations of each frame
 _ITERATIONS = 85
-# share of a Newton step in a step: larger ones oscillate
+# step size, as a share of the Newton step; larger steps oscillate
 _RATE = 0.12
-# iterations at the end, of half the rate
+# iterations at the end with half the rate
 _FINAL_ITERATIONS = 20
-# iteration before which contours move
+# contours move before this iteration
 _CONTOUR_ITERATION = 30
-# factor by which a move of a contour may raise the squared error about it: Gaussians adapt to it afterwards
+# factor by which a move of a contour may raise the squared error around it: Gaussians adapt to it afterwards
 _MAX_RISE = 1.5
-# pixels: no Gaussian gets thinner
+# least standard deviation of a Gaussian, in pixels
 _MIN_SIGMA = 0.5
-# weight of the error of a row that may not move, so large that it is never relocated
+# weight of the error of a row that may not move, so large that the row is never relocated
 _FIXED_WEIGHT = 1e9
-# sum of the weights of all Gaussians at most pixels; where it is larger, steps are shorter
+# usual sum of the weights of all Gaussians at a pixel; where the sum is larger, steps are shorter
 _USUAL_OVERLAP = 12.0
 
 
 def renderer_of(scene: Scene, config: FitConfig) -> Renderer:
-    """Return what the frames of a fit are rendered with: the map of one, and the cutoff of a draft."""
+    """Return the renderer of a frame in a fit: with the map of its scene, and the draft cutoff."""
     return Renderer(scene.size, scene.regions, draft_cutoff(config.cutoff), config.backend)
 
 
 class FrameDescent(NewtonDescent):
     """Newton steps, relocations of rows and moves of contours towards an image.
 
-    Newton steps, unlike Adam's, leave what is still in a video where it is: Adam moves it six times as far.
+    Newton steps hardly move Gaussians of still parts of a video; Adam moves them six times as far.
 
     Args:
         image: (C, H, W).
         scene: the start.
         config: of the fit, with an objective.
         movable_rows: Gaussians that may move, bool (N,).
-        changed_pixels: where Gaussians may be relocated to, bool (H, W).
+        changed_pixels: pixels to which Gaussians may be relocated, bool (H, W).
     """
 
     def __init__(
@@ -74,15 +74,15 @@ class FrameDescent(NewtonDescent):
 
     @property
     def scene(self) -> Scene:
-        """The Gaussians and the map at the moment."""
+        """The current Gaussians and map."""
         return Scene(self.gaussians.field(self.renderer.size), self.renderer.regions)
 
     def run(self, relocations: Mapping[int, float], anchor: Tensor | None = None) -> Scene:
         """Return the scene after the descent, or the start if its error is lower.
 
         Args:
-            relocations: share of the movable rows that is relocated, by the iteration before which it is.
-            anchor: labels that contours move from, as far as the config allows; None: they stay.
+            relocations: share of the movable rows that is relocated before an iteration, by iteration.
+            anchor: labels from which contours move, at most as far as the config allows; None: contours stay.
         """
         before = self.squared_error()
         events: list[Event] = [
@@ -106,13 +106,13 @@ class FrameDescent(NewtonDescent):
         super().step(rate)
 
     def color_curvature(self) -> Tensor:
-        """Return half the second derivative of the error by a colour, larger where Gaussians are crowded."""
+        """Return half the second derivative of the error with respect to a colour, larger where Gaussians overlap."""
         return super().color_curvature() * self.overlap
 
     def _relocate(self, share: float) -> None:
-        """Move so many of the rows, those of the lowest impact, to where they lower the error most.
+        """Relocate a share of the movable rows, those of the lowest impact, to where they lower the error most.
 
-        Rows that lower it nowhere get the colour 0.
+        Rows that lower the error nowhere get the colour 0.
         """
         gaussians, renderer = self.gaussians, self.renderer
         count = round(share * int(self.movable_rows.sum()))
@@ -133,9 +133,9 @@ class FrameDescent(NewtonDescent):
             self.gaussians = self.gaussians._replace(region_ids=ids)
 
     def _overlap(self) -> tuple[Tensor, Tensor]:
-        """Return the share of each Gaussian that is visible, and the factor by which its place is crowded, (N,) each.
+        """Return the visible share of each Gaussian, and the factor by which it overlaps others, (N,) each.
 
-        Gaussians in one place move together: with the second derivative of one alone, their steps would be too long.
+        Overlapping Gaussians move together: with the second derivative of a single one, their steps would be too long.
         """
         total, sums = self.renderer.weight_sums(self.gaussians)
         areas = self_product(self.gaussians.cholesky)
@@ -143,6 +143,6 @@ class FrameDescent(NewtonDescent):
         return visibility, (sums(total) / areas / _USUAL_OVERLAP).clamp_min(1.0)
 
     def _move_contours(self, anchor: Tensor) -> None:
-        """Move contours to where the error is lower, or little higher."""
+        """Move contours; a move may raise the error around it by the factor `_MAX_RISE`."""
         regions = move_contours(self.gaussians, self.renderer, self.image, anchor, self.config, _MAX_RISE)
         self.renderer = self.renderer._replace(regions=regions)

@@ -1,4 +1,4 @@
-"""Edits of all frames: what a region hides is filled from frames that show it, which a single image cannot."""
+"""Edits of all frames of a video: pixels that a region hides are filled from frames that show them."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from .stacking import stack
 @torch.inference_mode(False)
 @torch.no_grad()
 def delete_from_video(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
-    """Delete regions from all frames, and show what is behind them; :func:`kcgs.editing.delete_region` edits one image.
+    """Delete regions from all frames, and show the background; :func:`kcgs.editing.delete_region` edits one image.
 
-    Convention: a hidden pixel takes colour and label from the nearest frame that shows it. Its place there follows from
-    the motion of the Gaussians of the other regions, which is taken as affine. What no frame shows continues its
-    surroundings. The rows of the deleted regions are fitted to these pixels.
+    Convention: a hidden pixel takes colour and label from the nearest frame that shows it. Its place there is computed
+    from the motion of the other regions' Gaussians; this motion is assumed to be affine. Pixels that no frame shows
+    continue their surroundings. The rows of the deleted regions are fitted to the filled pixels.
 
     Args:
-        scenes: T frames with label maps, as :func:`fit_video` gives them.
+        scenes: T frames with label maps, as :func:`fit_video` returns them.
         region_ids: an id of the maps, or several.
 
     Returns:
@@ -38,7 +38,7 @@ def delete_from_video(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
 
     Raises:
         TypeError: no batch of scenes.
-        ValueError: no label maps, an unknown id, or a frame of which nothing is left.
+        ValueError: no label maps, an unknown id, or a frame without other regions.
 
     Example:
         >>> labels = torch.zeros(3, 16, 24, dtype=torch.long)
@@ -51,8 +51,8 @@ def delete_from_video(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
     """
     regions, row_ids, deleted_ids = _check(scenes, region_ids)
     deleted_pixels, deleted_rows = torch.isin(regions.labels, deleted_ids), torch.isin(row_ids, deleted_ids)
-    # scenes don't keep the config of their fit; of it a descent uses the backend and the cutoff, whose defaults suit
-    # every scene, and the objective
+    # scenes do not store the config of their fit: a descent uses only its objective, backend and cutoff, and the
+    # defaults of the latter two suit every scene
     config, frames = FitConfig(objective="l2"), list[Scene]()
     with threads_for_kernels(scenes.size[0] * scenes.size[1]):
         motions = affine_motions(scenes.field.means.detach(), ~deleted_rows)
@@ -62,7 +62,7 @@ def delete_from_video(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
             means, cholesky, colors = (table.clone() for table in Gaussians.of(scene.field)[:3])
             ids = torch.where(deleted_rows[t], new_regions[t].ids[0], row_ids[t])
             colors[deleted_rows[t]] = 0.0
-            if t:  # rows that filled the frame before go on
+            if t:  # rows that filled the frame before continue
                 rows, before = deleted_rows[t] & deleted_rows[t - 1], Gaussians.of(frames[-1].field)
                 means[rows] = apply_affine(motions[t] @ motions[t - 1].inverse(), before.means[rows])
                 cholesky[rows], colors[rows] = before.cholesky[rows], before.colors[rows]
@@ -80,14 +80,14 @@ def delete_from_video(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
 @torch.inference_mode(False)
 @torch.no_grad()
 def move_in_video(scenes: Scene, region_ids: int | Iterable[int], offset: Sequence[float]) -> Scene:
-    """Move regions in all frames, over what lies there; :func:`kcgs.editing.move_region` edits one image.
+    """Move regions in all frames, over the regions at the new place; :func:`kcgs.editing.move_region` edits one image.
 
-    Convention: what they leave is filled as :func:`delete_from_video` does it.
+    Convention: the pixels that they leave are filled as by :func:`delete_from_video`.
 
     Args:
-        scenes: T frames with label maps, as :func:`fit_video` gives them.
+        scenes: T frames with label maps, as :func:`fit_video` returns them.
         region_ids: an id of the maps, or several, which move together.
-        offset: (dx, dy) in pixels, whole.
+        offset: (dx, dy) in whole pixels.
 
     Returns:
         New scenes, without a graph. The rows of the regions come last.
@@ -113,7 +113,7 @@ def move_in_video(scenes: Scene, region_ids: int | Iterable[int], offset: Sequen
 
 
 def _check(scenes: Scene, region_ids: int | Iterable[int]) -> tuple[RegionMap, Tensor, Tensor]:
-    """Return the maps, the ids of the rows (T, N), and the ids of the argument."""
+    """Validate the arguments; return the maps, the region ids of the rows (T, N), and the ids of the argument."""
     count, regions, row_ids = len(check_batch(scenes)), scenes.regions, scenes.field.region_ids
     if regions is None or row_ids is None or regions.num_maps != count:
         raise ValueError("scenes must have a label map for each frame, and region ids")

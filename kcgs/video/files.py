@@ -1,4 +1,4 @@
-"""Video files, by PyAV, and folders of images and of label maps; one frame is in memory at a time."""
+"""Video files (by PyAV), and folders of images or label maps; one frame is in memory at a time."""
 
 import math
 import os
@@ -19,24 +19,24 @@ from kcgs._image import as_image
 from kcgs._suffixes import LABEL_MAPS, WRITTEN_IMAGES
 from kcgs.data import load_image, load_labels, save_image
 
-# frames per second where a file or an iterable does not have a rate
+# frames per second if a file or an iterable has no rate
 DEFAULT_FRAME_RATE = 24.0
 # matrix, primaries and transfer in H.273
 _BT709 = 1
 # AVCOL_RANGE_MPEG
 _LIMITED_RANGE = 1
-# swscale: bicubic, chroma of every pixel, accurate rounding; 2.8 dB over its default
+# flags of swscale: bicubic, chroma of every pixel, accurate rounding; 2.8 dB better than the default
 _SCALING = 0x4 | 0x2000 | 0x40000
 # x264's constant rate factor: visually lossless
 _RATE_FACTOR = 14
-# of a frame rate as a fraction
+# largest denominator of a frame rate as a fraction
 _MAX_DENOMINATOR = 65535
 
 
 class Frames:
-    """An iterable of frames :math:`(3, H, W)` in [0, 1] that reads them anew in every loop.
+    """An iterable of frames :math:`(3, H, W)` in [0, 1] that reads the file again in every loop.
 
-    It has their ``size`` (H, W) and their ``frame_rate``.
+    It has the attributes ``size`` (H, W) and ``frame_rate``.
     """
 
     def __init__(self, path: Path, frame_rate: float | None) -> None:
@@ -59,13 +59,13 @@ class Frames:
 def read_video(path: str | os.PathLike[str], *, frame_rate: float | None = None) -> Frames:
     """Open a video file or a folder of images as an iterable of frames.
 
-    Of a file, the first video stream is read with 8 bits per channel and turned upright. Colours follow the matrix of
-    the file, BT.601 where it has none. HDR is not mapped, and a variable frame rate is not resampled. Images of a
+    The first video stream of a file is read with 8 bits per channel and turned upright. Colours follow the matrix of
+    the file, or BT.601 if it has none. HDR is not mapped, and a variable frame rate is not resampled. Images of a
     folder come in natural order, ``9.png`` before ``10.png``.
 
     Args:
-        path: a video file (``pip install av``), or a folder of images as `load_image` reads them.
-        frame_rate: frames per second, above 0; None: the mean rate of the file, 24 where it has none.
+        path: a video file (``pip install av``), or a folder of images that `load_image` reads.
+        frame_rate: frames per second, above 0; None: the mean rate of the file, or 24 if it has none.
 
     Returns:
         The frames, :math:`(3, H, W)` float32 in [0, 1], with ``size`` (H, W) and ``frame_rate``.
@@ -117,10 +117,10 @@ def read_label_maps(folder: str | os.PathLike[str]) -> list[Tensor]:
 
 
 def write_video(path: str | os.PathLike[str], frames: Iterable[Any], frame_rate: float) -> None:
-    """Write frames as a video file, whole or not at all, or as a folder of PNG images.
+    """Write frames as a video file, atomically, or as a folder of PNG images.
 
-    A file is visually lossless H.264 in BT.709; the same frames give the same bytes. Even sizes are yuv420p, which
-    everything plays; odd sizes are yuv444p, which many browsers and telephones do not play.
+    A file is visually lossless H.264 in BT.709; the same frames give the same bytes. Even sizes are yuv420p, which all
+    players can play; odd sizes are yuv444p, which many browsers and phones cannot play.
 
     Args:
         path: .mp4, .mov or .mkv (``pip install av``); without a suffix, a new or empty folder, which gets
@@ -132,7 +132,7 @@ def write_video(path: str | os.PathLike[str], frames: Iterable[Any], frame_rate:
         FileExistsError: the folder ``path`` is not empty.
         FileNotFoundError: the folder above ``path`` does not exist.
         ImportError: PyAV is not installed.
-        ValueError: there are no frames, one is no RGB image of the size of the first, or no video has the suffix.
+        ValueError: there are no frames, a frame is no RGB image of the first frame's size, or the suffix is unknown.
 
     Example:
         >>> import os, tempfile, torch

@@ -1,4 +1,4 @@
-"""Fits of a video: frames in, a batch of scenes out, in which a row is the same Gaussian from frame to frame."""
+"""Fit a video: the result is a batch of scenes in which a row is the same Gaussian from frame to frame."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ from .stacking import stack
 OnFrame = Callable[[int, Scene], bool | None]
 Labels = RegionMap | Tensor | NDArray[Any]
 
-# squared error of a start, as a share of the image's variance, from which on it is a scene cut
+# a scene cut is where the squared error of the start is above this share of the image's variance
 _CUT_SHARE = 0.5
 # share of the movable rows that is relocated, by iteration of the descent
 _RELOCATIONS = {0: 0.05, 20: 0.05, 40: 0.05, 60: 0.05}
-# A pixel changed where the mean error about it is more than `_MAX_GROWTH` times that of its fit, plus `_LEVEL`. Lower
-# values follow faint changes, higher ones flicker less.
+# A pixel changed if the mean error around it is more than `_MAX_GROWTH` times the mean error after its fit, plus
+# `_LEVEL`. Lower values follow faint changes, higher values flicker less.
 _MAX_GROWTH = 1.02
 # squared error of one level of 8 bits
 _LEVEL = 255.0**-2
-# pixels: side of the square of that mean
+# side of the square of this mean, in pixels
 _WINDOW = 15
-# share of a Gaussian's weights on changed pixels from which on it may move
+# a Gaussian may move if at least this share of its weights is on changed pixels
 _MOVABLE_SHARE = 0.1
 
 
@@ -59,30 +59,30 @@ def fit_video(
     progress: bool = False,
     **settings: Any,
 ) -> Scene:
-    r"""Fit Gaussians to the frames of a video: time is the batch.
+    r"""Fit Gaussians to the frames of a video: the batch dimension is time.
 
     Convention: row i is the same Gaussian in every frame until it is relocated. The first frame is fitted by
-    :func:`kcgs.fit`. Every other frame starts from the Gaussians of the frame before, which move with the image. Then a
-    short descent follows, in which contours move and the least useful 5 % of the rows are relocated four times. Where
-    the error has not grown, Gaussians stand still. A row without use has colour 0. After a scene cut a frame is fitted
-    anew, into the same rows. Regions are not merged. Contours have the softness of the first frame. The same arguments,
-    device and number of threads give the same scenes, bit for bit.
+    :func:`kcgs.fit`. Every other frame starts from the Gaussians of the frame before, moved along the optical flow. A
+    short descent follows: contours move, and the 5 % of the rows with the lowest impact are relocated four times. Where
+    the error has not grown, Gaussians do not move. Unused rows have the colour 0. The first frame after a scene cut is
+    fitted like the first frame, into the same rows. Regions are not merged. Contours keep the softness of the first
+    frame. The same arguments, device and number of threads give the same scenes, bit for bit.
 
     Args:
-        frames: T images of one size, as :func:`kcgs.fit` takes them, such as :func:`read_video` gives; two are in
+        frames: T images of one size, as :func:`kcgs.fit` takes them, for example from :func:`read_video`; two are in
             memory at a time.
-        label_maps: one for each frame; or that of the first frame, :math:`(H, W)`, which moves with the image up to a
-            scene cut, and is one region from there. None: one region.
-        num_gaussians: N, of every frame; None: one per 100 pixels, at least 100.
-        recipe: of the first frame, and of the first after a scene cut.
+        label_maps: one map for each frame; or one map of the first frame, :math:`(H, W)`, which moves with the image
+            until a scene cut and then becomes one region. None: one region.
+        num_gaussians: N of every frame; None: one per 100 pixels, at least 100.
+        recipe: of the first frame, and of the first frame after a scene cut.
         seed: of the random start.
         on_frame: called with the number of every frame, from 0, and its scene; returning True ends the fit.
-        progress: show the number of frames that are fitted.
+        progress: show the number of fitted frames.
         settings: fields of :class:`kcgs.FitConfig`, in place of the recipe's.
 
     Returns:
-        Scenes: a field of T x N Gaussians, T label maps if there are any, and ``metadata["frame_rate"]``, in frames
-        per second: that of `frames`, or 24.
+        Scenes: a field of T x N Gaussians, T label maps if there are any, and ``metadata["frame_rate"]``, the frames
+        per second of `frames`, or 24.
 
     Raises:
         TypeError: wrong types.
@@ -114,16 +114,16 @@ def fit_video(
 
 
 class _VideoFit:
-    """A fit of one frame after the other."""
+    """A fit of one frame after another."""
 
     def __init__(self, config: FitConfig, num_gaussians: int | None, seed: int) -> None:
         self.config, self.num_gaussians, self.seed = config, num_gaussians, seed
         self.frames: list[Scene] = []
         self.image = torch.zeros(())  # the last frame, (C, H, W); a placeholder before the first
-        self.error = torch.zeros(())  # of each pixel when it was last fitted, (H, W)
+        self.error = torch.zeros(())  # squared error of each pixel when it was last fitted, (H, W)
 
     def fit_next(self, frame: Any, labels: Labels | None) -> Scene:
-        """Fit a frame; without labels the map of the frame before moves along, where there is one."""
+        """Fit a frame; without labels, the map of the frame before moves along the optical flow."""
         previous = self.image
         self.image, regions = check_image_and_regions(frame, labels)
         changed_pixels = torch.ones_like(self.image[0], dtype=torch.bool)
@@ -144,7 +144,7 @@ class _VideoFit:
         return renderer_of(scene, self.config).squared_error(Gaussians.of(scene.field), self.image)
 
     def _fit_anew(self, regions: RegionMap | None) -> Scene:
-        """Fit a frame by itself; rows that it leaves unused have colour 0."""
+        """Fit a frame independently of other frames; unused rows have the colour 0."""
         config = self.config
         if self.frames:  # contours have the softness of the first frame
             config = config.model_copy(update={"softness": 0.0})
@@ -154,7 +154,7 @@ class _VideoFit:
         return Scene(pad_rows(scene.field, count, regions), regions)
 
     def _follow(self, flow: Tensor, regions: RegionMap | None) -> tuple[Scene, Tensor]:
-        """Return a frame, fitted from the one before, and the mask of the pixels that changed."""
+        """Fit a frame from the frame before; return its scene and the mask of the changed pixels."""
         first, before = self.frames[0].regions, self.frames[-1].regions
         is_moved = regions is None
         if first is not None and before is not None:
@@ -172,12 +172,12 @@ class _VideoFit:
         return start, changed_pixels
 
     def _start(self, flow: Tensor, regions: RegionMap | None) -> tuple[Scene, Tensor, Tensor]:
-        """Return the Gaussians before, moved, the mask of those that may move, and that of the pixels that changed.
+        """Return the moved Gaussians of the frame before, the mask of movable rows, and the mask of changed pixels.
 
-        A pixel changed if the Gaussians, not moved, explain its surroundings less well than when they were fitted.
+        A pixel changed if the unmoved Gaussians have a larger error around it than when they were fitted.
         """
         means, cholesky, colors, region_ids = Gaussians.of(self.frames[-1].field)
-        if regions is not None and region_ids is not None:  # rows of a region that is gone have no use
+        if regions is not None and region_ids is not None:  # rows of lost regions become unused
             is_present = torch.isin(region_ids, regions.ids)
             region_ids = torch.where(is_present, region_ids, regions.ids[0])
             colors = torch.where(is_present[:, None], colors, 0.0)
@@ -210,7 +210,7 @@ def _move_means(flow: Tensor, gaussians: Gaussians, regions: RegionMap | None) -
 
 
 def _pair(frames: Iterable[Any], label_maps: Labels | Iterable[Labels] | None) -> Iterator[tuple[Any, Labels | None]]:
-    """Yield each frame with its label map; with None after a single map, or if there is none."""
+    """Yield each frame with its label map, or with None: after a single map, or if there are no maps."""
     maps: Iterator[Labels | None]
     if label_maps is None:
         maps = repeat(None)

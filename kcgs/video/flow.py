@@ -7,18 +7,18 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
 
-# pixels: shorter side of the images whose flow is estimated; larger ones take longer and show finer motion
+# shorter side of the reduced images whose flow is estimated, in pixels; larger images take longer and show finer motion
 _SIDE = 160
-# pixels of these: half the side of the window in which the flow is constant; larger ones are more robust
+# half the side of the window in which the flow is constant, in reduced pixels; larger windows are more robust
 _RADIUS = 5
-# of the fixed point in `move_points`, which converges where neighbouring offsets differ by less than a pixel per pixel
+# fixed-point iterations of `move_points`: they converge where offsets change by less than a pixel per pixel
 _ITERATIONS = 5
 
 
 def optical_flow(previous: Tensor, image: Tensor) -> Tensor:
-    """Return the offset (x, y) from each pixel of an image to its place in the previous one, (2, H, W), in pixels.
+    """Return the offset (x, y) from each pixel of an image to its place in the previous image, (2, H, W), in pixels.
 
-    Source: the iterative Lucas-Kanade solver of scikit-image, `optical_flow_ilk`, on smaller grey images.
+    Source: the iterative Lucas-Kanade solver of scikit-image, `optical_flow_ilk`, on reduced grey images.
     """
     from skimage.registration import optical_flow_ilk
 
@@ -34,7 +34,7 @@ def optical_flow(previous: Tensor, image: Tensor) -> Tensor:
 
 
 def sample(planes: Tensor, points: Tensor) -> Tensor:
-    """Sample a flow or an image (C, H, W) bilinearly at points (N, 2); outside it continues from the border."""
+    """Sample a flow or an image (C, H, W) bilinearly at points (N, 2); outside, it has the values of its border."""
     height, width = planes.shape[1:]
     grid = points / points.new_tensor([width, height]) * 2 - 1
     values = grid_sample(planes[None], grid[None, None].to(planes), padding_mode="border", align_corners=False)
@@ -42,7 +42,7 @@ def sample(planes: Tensor, points: Tensor) -> Tensor:
 
 
 def move_points(flow: Tensor, points: Tensor) -> Tensor:
-    """Return the places in the image of points (N, 2) of the previous one: q with q + flow(q) = p."""
+    """Return the places q in the image of points p (N, 2) of the previous image: q + flow(q) = p."""
     places = points
     for _ in range(_ITERATIONS):
         places = points - sample(flow, places)
@@ -50,7 +50,7 @@ def move_points(flow: Tensor, points: Tensor) -> Tensor:
 
 
 def move_labels(flow: Tensor, labels: Tensor) -> Tensor:
-    """Return the labels (H, W) for the image, each read at the pixel's place in the previous one."""
+    """Return the labels (H, W) of the image, each read at the pixel's place in the previous image."""
     height, width = labels.shape
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     cols = (x.to(flow) + flow[0]).round().long().clamp(0, width - 1)

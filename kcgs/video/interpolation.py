@@ -19,11 +19,11 @@ def interpolate(scenes: Scene, time: float) -> Scene:
     """Return the scene at any time of a batch of scenes.
 
     Convention: between two frames the scene has the Gaussians of both, moved along the optical flow between their
-    renders. Those of the earlier frame fade out while those of the later fade in. The label map is that of the earlier
-    frame, moved.
+    renders. The Gaussians of the earlier frame fade out while those of the later frame fade in. The label map is the
+    moved map of the earlier frame.
 
     Args:
-        scenes: T frames, as :func:`fit_video` gives them.
+        scenes: T frames, as :func:`fit_video` returns them.
         time: in frames, 0 to T - 1.
 
     Returns:

@@ -1,4 +1,4 @@
-"""The frames of a video as one scene."""
+"""Stack the frames of a video into one scene."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from kcgs.scene import Scene
 
 
 def stack(frames: Sequence[Scene], metadata: Mapping[str, str]) -> Scene:
-    """Return the Gaussians and the maps of all frames as one scene."""
+    """Stack the Gaussians and the maps of all frames into one scene."""
     field = GaussianField.stack([frame.field for frame in frames])
     maps = [frame.regions for frame in frames if frame.regions is not None]
     if not maps:
