@@ -13,7 +13,7 @@ from .graph import FLOAT, INT64, Graph, Value
 
 # nodes, two pixels apart, that the cubic B-splines of a tile read
 NODES = TILE // 2 + 3
-# integers per pixel: in these parts the ends of a view are rounded
+# parts per pixel of the scene: the ends of a view are rounded to them
 _PARTS = 1 << 20
 
 
@@ -21,49 +21,49 @@ _PARTS = 1 << 20
 class Axis:
     """Rows, or columns, of the output.
 
-    Pixels whose centres lie in the same tile of the scene make a run. Every run is cut into the same number of blocks,
-    of one length, at most `TILE` pixels, with some pixels to spare at the end of shorter runs. Places are integers over
-    a common denominator: pixel i is at (2 n start + (2 i + 1) (end - start)) / 2 n, so that a contour's pixels fall on
-    the same side everywhere, and not all runtimes have float64. Where pixels of the output are larger than those of the
-    scene, more are rendered first, as many as the scene has there and at most twice those of the whole; `shrink` then
-    takes means.
+    Pixels whose centres lie in the same tile of the scene form a run. Every run is cut into the same number of blocks,
+    all of the same length, at most `TILE` pixels; shorter runs have spare pixels at their end. Places are integers over
+    a common denominator: pixel i is at (2 n start + (2 i + 1) (end - start)) / 2 n. So a contour's pixels are on the
+    same side in every runtime, without float64, which some runtimes lack. If output pixels are larger than pixels of
+    the scene, more pixels are rendered first: as many as the scene has in this part, but at most twice the pixels of
+    the whole scene; `shrink` then averages them.
     """
 
     graph: Graph
     length: int  # pixels of the scene
     output: Value  # (1,) int64, pixels of the output
     size: Value  # (1,) int64, pixels that are rendered
-    parts: Value  # (1,) int64, integers of a place per pixel of the scene
-    is_native: Value  # (1,) bool, whether the pixels are those of the scene, and a tile one block
-    is_aligned: Value  # (1,) bool, whether pixels are as large as those of the scene, and at their places
+    parts: Value  # (1,) int64, unit of `local`: parts per pixel of the scene
+    is_native: Value  # (1,) bool, whether pixels are the scene's pixels from its start, and a tile is one block
+    is_aligned: Value  # (1,) bool, whether pixels have the size and the places of the scene's pixels
     step: Value  # (1,) float32, pixels of the scene per rendered pixel
-    tile: Value  # (V,), tiles with a run, one after the other; a constant where all of the scene is rendered
+    tile: Value  # (V,), consecutive tiles with a run; a constant if the whole scene is rendered
     runs: Value  # (V,), pixels of each run
     pieces: Value  # (1,), blocks of a run
     side: Value  # (1,), pixels of a block
-    local: Value  # (V, pieces, side) int64, pixel centres from the corner of the tile, in parts
-    steps: Value  # (side,), pixel centres from the middle of a block, where polynomials are rounded least
-    origins: Value  # (V, pieces), middles of blocks from the centre of their tile
+    local: Value  # (V, pieces, side) int64, pixel centres relative to the corner of the tile, in parts
+    steps: Value  # (side,), pixel centres relative to the middle of a block, where polynomials have least rounding
+    origins: Value  # (V, pieces), middles of blocks relative to the centre of their tile
 
     @property
     def padded(self) -> Value:
-        """Pixels of all blocks, (1,)."""
+        """Number of pixels of all blocks, (1,)."""
         return self.graph.Shape(self.runs) * self.pieces * self.side
 
     def sampling(self) -> Value:
-        """Bilinear weights of a window, a tile and the pixels around it, (V, pieces, side, window)."""
+        """Return bilinear weights of a window (a tile and the pixels around it), (V, pieces, side, window)."""
         g = self.graph
         position = g.Unsqueeze(self.local, [3]).astype(FLOAT) / self.parts.astype(FLOAT) + 0.5
-        # a view may go beyond the scene, where the values of the border are held
+        # outside the scene, a view has the values of the scene's border
         first = g.Unsqueeze(1 - self.tile * TILE, [1, 2, 3])
         for clip, end in ((g.Max, 0), (g.Min, self.length - 1)):
             position = clip(position, (first + end).astype(FLOAT))
         return g.Relu(1 - g.Abs(position - np.arange(TILE + 2, dtype=np.float32)))
 
     def spline(self) -> Value:
-        """Weights of a tile's nodes, two pixels apart, at the pixels of each block, (V, pieces, side, NODES).
+        """Return the weights of a tile's nodes, two pixels apart, at each block's pixels, (V, pieces, side, NODES).
 
-        Beyond the scene the values of its border are held.
+        Outside the scene the values of its border hold.
         """
         g = self.graph
         position = g.Unsqueeze(self.local, [3]).astype(FLOAT) / self.parts.astype(FLOAT)
@@ -76,13 +76,13 @@ class Axis:
         return far * (1 / 6) - near * (2 / 3)
 
     def is_even(self) -> Value:
-        """Whether pixels to spare lie only behind the last run, (1,)."""
+        """Return whether all spare pixels are at the end of the last run, (1,)."""
         g = self.graph
         last = g.Slice(self.runs, [-1], [1 << 30], [0])
         return g.Equal(self.padded - (self.pieces * self.side - last), self.size)
 
     def places(self) -> Value:
-        """Where each pixel is among those of all blocks, (size,)."""
+        """Return the index of each pixel among the pixels of all blocks, (size,)."""
         g = self.graph
         length = g.Squeeze(self.pieces * self.side)
         is_pixel = g.Less(g.Range(0, length, 1), g.Unsqueeze(self.runs, [1]))
@@ -90,7 +90,7 @@ class Axis:
         return g.Compress(places, g.Reshape(is_pixel, [-1]), axis=0)
 
     def shrink(self, image: Value, places: Value, axis: int) -> Value:
-        """Reduce the rendered pixels, at `places`, to those of the output: means over their shares of the length."""
+        """Reduce the rendered pixels, at `places`, to output pixels: means weighted by shares of the length."""
         g = self.graph
         begin = g.Unsqueeze(g.Range(0, g.Squeeze(self.output), 1) * self.size, [1])
         longest = (self.size + (self.output - 1)) // self.output + 1
@@ -105,13 +105,13 @@ class Axis:
 
 
 def make_axis(g: Graph, output: Value, length: int, ends: tuple[Value, Value] | None = None) -> Axis:
-    """Place so many pixels, (1,), along `length` pixels of the scene, or along the part between `ends`, (1,) each."""
+    """Place `output` pixels, (1,), along `length` pixels of the scene, or along the part between `ends`, (1,) each."""
     if ends is None:
         start, extent = g.constant([0]), g.constant([length * _PARTS])
     else:
         start, end = ((bound * _PARTS).astype(INT64) for bound in ends)
         extent = g.Max(end - start, 1)
-    # rounded up, but for what rounding of the ends may add; a view far beyond the scene has no more to show
+    # rounded up, with a tolerance for the rounding of the ends; a view far beyond the scene needs no more pixels
     pixels = (extent + (_PARTS - 1 - _PARTS // 256)) // _PARTS
     size = g.Max(output, g.Min(pixels, 2 * length))
     parts = size * (2 * _PARTS)
@@ -122,11 +122,11 @@ def make_axis(g: Graph, output: Value, length: int, ends: tuple[Value, Value] | 
         tile = g.constant(np.arange(tiles))
     else:
         centres = (extent + shift, (size * 2 - 1) * extent + shift)  # of the first and the last pixel
-        # bounded once it is small: onnxruntime 1.31 takes the wrong one of two int64 beyond 32 bits
+        # clip after the division: Min and Max of onnxruntime 1.31 are wrong for int64 beyond 32 bits
         first, last = (g.Squeeze(g.Min(g.Max(c // (parts * TILE), 0), tiles - 1)) for c in centres)
         tile = g.Range(first, last + 1, 1)
     corner = tile * TILE * parts
-    # the first pixel of a run is the first whose centre is not left of the corner; those left of the scene are tile 0's
+    # a run begins at the first pixel whose centre is not left of the corner; pixels left of the scene belong to tile 0
     begin = g.Max((corner - shift + extent - 1) // (extent * 2), 0) * g.Min(tile, 1)
     end = g.Concat(g.Slice(begin, [1], [1 << 30], [0]), size, axis=0)
     runs = end - begin
@@ -149,7 +149,7 @@ def make_axis(g: Graph, output: Value, length: int, ends: tuple[Value, Value] | 
 
 
 class Interpolator:
-    """Interpolates windows of n x n values around tiles at the pixels of their blocks, all column by column."""
+    """Interpolate windows of n x n values around tiles at the pixels of their blocks; all are stored by columns."""
 
     def __init__(self, down: Axis, across: Axis, rows: Value, columns: Value, side: int) -> None:
         """`rows` and `columns` are the weights of a window's values, (V, pieces, side, n); n is `side`."""
@@ -162,7 +162,7 @@ class Interpolator:
         self.is_aligned = self.graph.And(down.is_aligned, across.is_aligned)
 
     def blocks(self, windows: Value, row: Value, col: Value, shape: tuple[int, int]) -> Value:
-        """Interpolate windows, (T, K, n, n), in the blocks of tiles at `row` and `col`, (T,): (T, blocks, *shape, P).
+        """Interpolate windows, (T, K, n, n), at the blocks of tiles in `row` and `col`, (T,): (T, blocks, *shape, P).
 
         K is the product of `shape`.
         """

@@ -1,7 +1,7 @@
 """The image of a decoder, rendered in blocks of pixels.
 
-log w is a polynomial in the pixel. One matrix product of coefficients and monomials gives the weights of a list of
-Gaussians, and another one the colours. docs/onnx.md has the whole graph.
+The logarithm of a weight, log w, is a polynomial in the pixel's position. One matrix product of coefficients and
+monomials gives the weights of a list of Gaussians, a second one gives the colours. docs/onnx.md has the whole graph.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from .packing import pack_integers
 from .tiles import Tiles
 from .weights import monomials, weigh
 
-# The monomials 1, x, y, xx, xy, yy at (x + a, y + b) are those at (x, y) plus these terms: (factor, source, target,
-# multiplicity). A factor is one of 1, a, b, aa, ab, bb; the source is a monomial at (x + a, y + b).
+# The monomials 1, x, y, xx, xy, yy at (x + a, y + b) are the monomials at (x, y) plus these terms: (factor, source,
+# target, multiplicity). A factor is the index of 1, a, b, aa, ab, bb; the source is a monomial at (x + a, y + b).
 _SHIFT = (
     *((k, k, 0, 1) for k in range(1, 6)),
     (1, 3, 1, 2),
@@ -32,7 +32,7 @@ _SHIFT = (
 
 
 class BlockRenderer:
-    """Renders blocks group by group. Their rows are `down`, their columns `across`; all groups share the monomials."""
+    """Render blocks group by group; `down` has their rows, `across` their columns; all groups share the monomials."""
 
     def __init__(self, storage: Storage, down: Axis, across: Axis, cutoff: float) -> None:
         self.graph = storage.graph
@@ -49,7 +49,7 @@ class BlockRenderer:
     def image(self, membership: MembershipSampler | None, grids: CoarseGrids | None) -> Value:
         """Render the image, (1, C, H, W) with spare pixels; tiles with several regions need memberships.
 
-        Without a view the operators that sort tiles read constants only, and runtimes compute them at loading.
+        Without a view the operators that sort tiles read only constants, so that runtimes compute them on loading.
         """
         g, groups = self.graph, self.storage.plan.pixel_groups
         tile = g.Unsqueeze(self.down.tile * self.storage.plan.tiles.cols, [1]) + self.across.tile
@@ -67,7 +67,7 @@ class BlockRenderer:
                 rendered += [self._render_group(number, *members[number]) for number in numbers]
             else:
                 rendered.append(self._render_mixed(count, [*numbers], members, membership, grids))
-        # a black tile for all that nothing reaches
+        # one black tile, for all tiles that no Gaussian reaches
         shape = g.Concat([1], self.pieces, [self.storage.channels], self.pixels, axis=0)
         rendered.append(g.Expand(np.float32(0), shape))
         image = self._join(g.Concat(*rendered, axis=0), index)
@@ -76,7 +76,7 @@ class BlockRenderer:
         return image
 
     def _make_shifts(self) -> Value:
-        """Make matrices (V, Q, 6, 6) that move coefficients from the centre of a tile to the middles of its blocks."""
+        """Return matrices (V, Q, 6, 6) that move coefficients from the centre of a tile to the middles of blocks."""
         g = self.graph
         x, y = g.Unsqueeze(self.across.origins, [0, 2]), g.Unsqueeze(self.down.origins, [1, 3])
         basis = np.zeros((6, 6, 6), np.float32)
@@ -89,8 +89,8 @@ class BlockRenderer:
     def _sort(self, group: Value, count: int) -> tuple[Value, list[Value], list[Value], Value]:
         """Sort tiles by group, (V,); return the order, begins and ends of groups in it, and the place of each tile.
 
-        A group without a tile renders one of another group, which the image leaves out: not every runtime takes empty
-        tensors. For the last group the order has one more element.
+        A group without a tile renders a tile of another group, which the image does not use: some runtimes do not
+        accept empty tensors. So that this holds for the last group, the order has one more element.
         """
         g = self.graph
         total = g.Shape(group)
@@ -106,7 +106,7 @@ class BlockRenderer:
         return order, begins, ends, index
 
     def _render_group(self, number: int, tiles: Value, slots: Value, regions: Value | None = None) -> Value:
-        """Render Gaussians in tiles (T,) of a group, (T, Q, C, P), or for each of their regions, (T, Q, K * C, P)."""
+        """Render a group in its tiles (T,): (T, Q, C, P), or separately for each of their regions, (T, Q, K * C, P)."""
         g, entries = self.graph, self.storage.entries[number]
         colors = g.Unsqueeze(entries.shaped_colors(regions)[slots], [1])
         coefficients = g.Unsqueeze(entries.shaped_coefficients()[slots], [1])  # [T, 1, L, 6]
@@ -138,13 +138,13 @@ class BlockRenderer:
         return g.ReduceSum(values * membership.blocks(count, slots, row, col), [2], keepdims=0)
 
     def _polynomial(self, coefficients: Value, tiles: Value) -> Value:
-        """Log w as coefficients times monomials."""
+        """Return log w as coefficients times monomials."""
         g = self.graph
         centred = g.choose(self.is_native, lambda: g.Identity(coefficients), lambda: coefficients @ self.shifts[tiles])
         return centred @ self.monomials
 
     def _squares(self, coefficients: Value, tiles: Value) -> Value:
-        """Log w as a sum of squares, which no rounding of large coefficients harms."""
+        """Return log w as a negative sum of squares, which the rounding of large coefficients does not harm."""
         g, three = self.graph, self.graph.constant([3])
         shifts = g.Slice(self.shifts[tiles], [0, 0], [3, 3], [2, 3])
         linear = g.Slice(self.monomials, [0], three, [0])
@@ -152,7 +152,7 @@ class BlockRenderer:
         return -(z1 * z1 + z2 * z2)
 
     def _join(self, blocks: Value, index: Value) -> Value:
-        """Join the blocks of all tiles, (n, Q, C, P), to an image with pixels to spare; tile k is at `index`."""
+        """Join the blocks of all tiles, (n, Q, C, P), to an image with spare pixels; tile k is at `index[k]`."""
         g, down, across, channels = self.graph, self.down, self.across, self.storage.channels
         first = g.Reshape(index * self.pieces, g.Concat([-1, 1], g.Shape(across.tile), [1], axis=0))
         piece = g.Reshape(g.Range(0, g.Squeeze(self.pieces), 1), g.Concat(down.pieces, [1], across.pieces, axis=0))
@@ -167,7 +167,7 @@ class BlockRenderer:
 
 
 def _regions_of_tiles(tiles: Tiles, ids: Integers, count: int) -> Integers:
-    """Regions of tiles, (T, K), filled up with one that no Gaussian has."""
+    """Return the regions of tiles, (T, K), padded with a region that no Gaussian has."""
     lists = [tiles.regions[tile] for tile in ids.tolist()]
     no_region = 1 + max(max(regions) for regions in tiles.regions)
     return np.array([regions + [no_region] * (count - len(regions)) for regions in lists])

@@ -1,4 +1,4 @@
-"""Windows of memberships, blurred out of labels. Made for `membership`."""
+"""Windows of memberships, computed by blurring labels; for `membership`."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ from .windows import pack_windows, tile_ids
 
 
 class BlurredWindows:
-    """Windows of memberships, blurred out of the labels around them; tiles by their number of regions.
+    """Windows of memberships, computed by blurring labels; `tiles_of` has the tiles by their number of regions.
 
-    A part of a window is what one region has by one width; parts are blurred at once, and summed later.
+    A part of a window is the membership of one region with one contour width; all parts are blurred at once, and summed
+    later.
     """
 
     def __init__(self, g: Graph, membership: Membership, tiles: Tiles, tiles_of: Mapping[int, Integers]) -> None:
@@ -49,7 +50,7 @@ class BlurredWindows:
             taken = g.Equal(g.constant(other.astype(np.int32))[pixels], region).astype(FLOAT)
             weights = (g.constant(part.astype(np.float32))[pixels] for part in (weight, other_weight))
             inside = inside * next(weights) + taken * next(weights)
-        # outside the map there is no label, and no membership
+        # pixels outside the map have no label and no membership
         blurred = blur(inside) / g.Max(blur(g.Less(pixels, np.int32(len(table) - 1))), 1e-30)
         if index is not None:
             is_own = g.Equal(pack_windows(g, width_index)[window], g.Unsqueeze(width, axes))
@@ -68,21 +69,21 @@ class BlurredWindows:
 
 
 def _list_kinds(membership: Membership) -> tuple[NDArray[np.float64], Integers]:
-    """List labels, weights, other labels and their weights that pixels have, (kinds, 4), and the kind of each, (H, W).
+    """List the kinds of pixels, (kinds, 4): label, weight, other label, its weight; and each pixel's kind, (H, W).
 
-    The last kind is that of pixels outside.
+    The last kind is for pixels outside the map.
     """
     index, none = membership.index, torch.zeros_like(membership.index)
     smooth = membership.smooth_labels if isinstance(membership, SmoothMembership) else (none, none, none)
     rows = torch.stack([part[0].double().flatten() for part in (index, *smooth)], 1).cpu().numpy()
     table, kinds = np.unique(rows, axis=0, return_inverse=True)
-    # a label that no region has, nor what fills up lists of regions
+    # neither a region nor the padding of lists of regions has this label
     outside = [[membership.table.num_regions + 1, 0, 0, 0]]
     return np.concatenate([table, outside]), kinds.reshape(index.shape[1:])
 
 
 def cut_windows(tiles: Tiles, ids: Integers, grid: Integers) -> Integers:
-    """Cut the windows of tiles, (T, S, S), out of what each pixel has, (H, W)."""
+    """Cut the windows of tiles, (T, S, S), out of a grid of pixels, (H, W)."""
     sides = [(1, TILE * count - length + 1) for count, length in zip((tiles.rows, tiles.cols), grid.shape, strict=True)]
     padded = np.pad(grid.astype(np.int64), sides, mode="edge")
     windows: Integers = sliding_window_view(padded, (WINDOW, WINDOW))[::TILE, ::TILE].reshape(-1, WINDOW, WINDOW)
@@ -90,9 +91,9 @@ def cut_windows(tiles: Tiles, ids: Integers, grid: Integers) -> Integers:
 
 
 def _list_parts(tiles: Tiles, ids: Integers, width_index: Integers) -> tuple[Integers, dict[int, Integers]]:
-    """List the window, region and width of each part, (3, parts), and the places of each tile's, [regions, widths].
+    """List window, region and width of each part, (3, parts), and the places of each tile's parts, [regions, widths].
 
-    Place 0 is that of zeros.
+    Place 0 is a part of zeros.
     """
     triples: list[tuple[int, int, int]] = []
     places: dict[int, Integers] = {}
@@ -104,9 +105,9 @@ def _list_parts(tiles: Tiles, ids: Integers, width_index: Integers) -> tuple[Int
 
 
 def _kernels(g: Graph, membership: Membership) -> Value:
-    """Make the blurs of V widths from the pixels of a label window to those of a window, (V, S, side)."""
+    """Return the blurs of V widths as matrices from the pixels of a label window to those of a window, (V, S, side)."""
     radius = membership.radius
-    # the taps of one more pixel are 0, and those of all pixels farther off
+    # the tap of the last distance is 0; it also stands for all larger distances
     steps = torch.arange(radius + 2, dtype=torch.float64)
     taps = truncated_gaussian(steps, torch.tensor(membership.widths, dtype=torch.float64)[:, None]).float().numpy()
     distance = np.abs(np.arange(WINDOW)[:, None] - np.arange(WINDOW + 2 * radius) + radius)
@@ -114,9 +115,9 @@ def _kernels(g: Graph, membership: Membership) -> Value:
 
 
 def _pixel_windows(g: Graph, tiles: Tiles, ids: Integers, pixels: Integers, radius: int, outside: int) -> Value:
-    """Cut windows out of integers (H, W) with all that their blur reads, (T, side, side), column by column.
+    """Cut windows out of integers (H, W) with all pixels that their blur reads, (T, side, side), by columns.
 
-    They are stored in tiles, with some `outside` around them: those of one number by that, the others by their pixels.
+    The integers are stored in tiles, with a rim of `outside`: uniform tiles as one number, other tiles by their pixels.
     """
     rows, cols = tiles.rows, tiles.cols
     rim = -(-(radius + 1) // TILE)  # tiles around the map
@@ -130,7 +131,7 @@ def _pixel_windows(g: Graph, tiles: Tiles, ids: Integers, pixels: Integers, radi
     slots[~mixed], slots[mixed] = flat, len(values) + np.arange(mixed.sum())
     plain = g.Expand(g.Unsqueeze(pack_integers(g, values), [1]), [len(values), TILE**2])
     numbers = g.Concat(g.Reshape(plain, [-1]), pack_runs(g, blocks[mixed].ravel()), axis=0)
-    # rows of a window: how many tiles from the window's, and where in their own; whole tiles along them
+    # rows of a window: offset of their tile, and their place in this tile; along the rows, whole tiles are read
     first, side = -1 - radius, WINDOW + 2 * radius
     tile, pixel = np.divmod(np.arange(first, first + side, dtype=np.int32), TILE)
     corner = pack_integers(g, (ids // cols + rim) * across + ids % cols + rim)

@@ -26,20 +26,21 @@ def scene_decoder(
 ) -> onnx.ModelProto:
     r"""Build the ONNX graph that renders one scene at any size.
 
-    Input ``size``, int64 (2,): height and width of the image. Output ``image``, float32 :math:`(1, C, H, W)`: what
-    :class:`kcgs.nn.RegionSplatRenderer` renders at that size. No operator scatters, so that it runs on WebGPU. Memory
-    and time grow with the pixels and with the Gaussians on each. For a part of a very large image there is ``view``.
+    Input ``size``, int64 (2,): height and width of the image. Output ``image``, float32 :math:`(1, C, H, W)`: the
+    render of :class:`kcgs.nn.RegionSplatRenderer` at this size. The graph runs on WebGPU, since no operator scatters.
+    Memory and time grow with the pixels and with the Gaussians at each pixel. The input ``view`` selects a part of a
+    very large image.
 
     Args:
         scene: one scene, no batch.
         cutoff: weights below it are skipped, as in :func:`kcgs.functional.region_splat`.
-        clamp: clip the image to [0, 1]; False: as the renderer gives it, which may be below 0 and above 1.
-        interactive: two more inputs. ``view``, float32 (4,): left, top, right and bottom of the part of the scene that
+        clamp: clip the image to [0, 1]; False: values may be below 0 and above 1, as in the renderer.
+        interactive: add two inputs. ``view``, float32 (4,): left, top, right and bottom of the part of the scene that
             fills the image, in pixels of the scene. ``visible``, float32 (R,): a factor on the Gaussians of each
             region, in the order of the map's ids.
 
     Returns:
-        A checked model, which `onnx.save` writes; :func:`describe_decoder` reads its metadata.
+        A checked model for `onnx.save`; :func:`describe_decoder` reads its metadata.
 
     Raises:
         TypeError: wrong types.
@@ -94,7 +95,7 @@ def _inputs(g: Graph, scene: Scene, interactive: bool) -> tuple[Axis, Axis, Valu
 
 
 def _crop(g: Graph, image: Value, down: Axis, across: Axis) -> Value:
-    """Leave out pixels to spare, and reduce an image that was rendered larger than the output."""
+    """Remove spare pixels, and reduce an image that was rendered larger than the output."""
 
     def crop() -> Value:
         return g.Slice(image, [0, 0], g.Concat(down.size, across.size, axis=0), [2, 3])

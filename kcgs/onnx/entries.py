@@ -1,4 +1,4 @@
-"""The lists of Gaussians of all tiles, which `blocks` and `grids` render: stored, and unfolded at loading."""
+"""The lists of Gaussians of all tiles for `blocks` and `grids`: stored compactly, and unfolded on loading."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from .weights import ROOT
 
 
 class Entries(NamedTuple):
-    """The lists of a group's T tiles, filled up to L Gaussians each: P = T L entries."""
+    """The lists of a group's T tiles, padded to L Gaussians each: P = T L entries."""
 
     graph: Graph
     group: Group
     channels: int
     tiles: Value  # (T,)
-    # (P, 6): of 1, x, y, xx, xy, yy in log w around the centre of the tile; or, narrow, of 1, x, y in z1 and z2
+    # (P, 6), relative to the centre of the tile: of 1, x, y, xx, xy, yy in log w; if narrow, of 1, x, y in z1 and in z2
     coefficients: Value
-    colors: Value  # (P, C), zero in what lists are filled up with
-    regions: Value  # (P,), position in the map
+    colors: Value  # (P, C), zero in padding
+    regions: Value  # (P,), index of the region in the map
     visible: Value | None  # (R,), factor on each region; None: all are shown
 
     def shaped_coefficients(self) -> Value:
-        """Coefficients, (T, L, 6)."""
+        """Return the coefficients, (T, L, 6)."""
         return self._shape(self.coefficients, 6)
 
     def shaped_colors(self, tile_regions: Value | None = None) -> Value:
-        """Colours, (T, K * C, L), zero where a Gaussian is of another of the tiles' regions, (T, K)."""
+        """Return colours, (T, K * C, L), for each of the tiles' regions, (T, K): zero for those of other regions."""
         g, colors = self.graph, self._shape(self.colors, self.channels)
         if self.visible is not None:
             colors = colors * self.visible[self._shape(self.regions, 1)]
@@ -51,7 +51,7 @@ class Entries(NamedTuple):
 
 
 class Storage(NamedTuple):
-    """All that a graph stores of the Gaussians."""
+    """The Gaussians that a graph stores, and their lists."""
 
     graph: Graph
     plan: DecoderPlan
@@ -67,7 +67,7 @@ class Storage(NamedTuple):
 
 
 def store_entries(g: Graph, plan: DecoderPlan, visible: Value | None) -> Storage:
-    """Store the Gaussians of a plan, and unfold the lists of all groups at once: every operator takes time to load."""
+    """Store the Gaussians of a plan; unfold all groups' lists at once, since every operator takes time to load."""
     slots = make_slots(g, plan)
     table = None if plan.nodes is None else make_node_table(g, plan.nodes)
     storage = Storage(g, plan, slots, table, [], visible)
@@ -76,21 +76,21 @@ def store_entries(g: Graph, plan: DecoderPlan, visible: Value | None) -> Storage
     groups, gaussians = plan.groups, plan.gaussians
     sizes = [len(group.tiles) * group.longest for group in groups]
     begins = [np.arange(size) % group.longest == 0 for size, group in zip(sizes, groups, strict=True)]
-    tile = g.CumSum(pack_flags(g, np.concatenate(begins)), 0) - 1  # of each entry, its rank
+    tile = g.CumSum(pack_flags(g, np.concatenate(begins)), 0) - 1  # rank of each entry's tile
     ids, mask = _list_gaussians(g, plan, slots, tile, sum(sizes))
     squares, polynomials = (g.split(part, sizes) for part in _whiten(g, plan, slots, table, ids, tile))
     colors = g.split(g.constant(gaussians.colors)[ids] * mask, sizes)
     regions = g.split(pack_integers(g, gaussians.region)[ids], sizes)
     for number, group in enumerate(groups):
         coefficients = (squares if group.narrow else polynomials)[number]
-        factors = None if group.nodes else visible  # coarse grids are made when the decoder is loaded
+        factors = None if group.nodes else visible  # coarse grids are computed on loading, before `visible` is known
         values = slots.tiles[number], coefficients, colors[number], regions[number], factors
         storage.entries.append(Entries(g, group, storage.channels, *values))
     return storage
 
 
 def _list_gaussians(g: Graph, plan: DecoderPlan, slots: Slots, tile: Value, count: int) -> tuple[Value, Value]:
-    """Return the Gaussian of each of `count` entries, (P,), and a mask, (P, 1): 0 for entries that fill a list up."""
+    """Return the Gaussian of each of `count` entries, (P,), and a mask, (P, 1), that is 0 for padding."""
     lengths = pack_integers(g, np.concatenate([group.lengths for group in plan.groups]))
     longest = pack_runs(g, np.concatenate([np.full(len(group.tiles), group.longest) for group in plan.groups]))
     firsts, begins = (g.CumSum(n, 0, exclusive=1) for n in (lengths, longest))
@@ -122,7 +122,7 @@ def _sorted_pairs(g: Graph, plan: DecoderPlan, slots: Slots) -> Value:
 def _whiten(
     g: Graph, plan: DecoderPlan, slots: Slots, table: NodeTable | None, ids: Value, tile: Value
 ) -> tuple[Value, Value]:
-    """Coefficients of all entries, (P, 6): of 1, x, y in whitened coordinates, and of their polynomial log w.
+    """Return the coefficients of all entries, (P, 6) each: of whitened coordinates, and of the polynomial log w.
 
     Whitened coordinates z are scaled by sqrt(1/2): log w is minus their sum of squares.
     """
@@ -140,7 +140,7 @@ def _whiten(
 
 
 def _places(g: Graph, plan: DecoderPlan, table: NodeTable | None) -> Value:
-    """Columns and rows of tiles, and of blocks of nodes, (n, 2)."""
+    """Return the columns and rows of all tiles and blocks of nodes, (n, 2)."""
     tiles = plan.tiles
     tile = g.Range(np.int32(0), np.int32(len(tiles.regions)), np.int32(1))
     cols, rows = tile % tiles.cols, tile // tiles.cols

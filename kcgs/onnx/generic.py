@@ -1,4 +1,4 @@
-"""The decoder of any Gaussians: a graph that takes them and the memberships of regions, and loops over tiles."""
+"""The decoder of any Gaussians: its inputs are Gaussians and memberships of regions, and it loops over tiles."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from .graph import BOOL, FLOAT, INT64, Graph, Value
 from .metadata import decoder_metadata, image_doc
 from .weights import ROOT, weigh
 
-# side of a tile in pixels: smaller ones take more turns of the loop, larger ones more Gaussians that reach none of
-# their pixels
+# side of a tile in pixels: smaller tiles need more turns of the loop, larger tiles evaluate more Gaussians at pixels
+# that they do not reach
 _SIDE = 32
 
 
 def generic_decoder(*, cutoff: float = 1e-4, clamp: bool = True) -> onnx.ModelProto:
-    r"""Build the graph that renders any Gaussians, such as those that a network predicts.
+    r"""Build the graph that renders any Gaussians, for example the prediction of a network.
 
-    Convention: inputs ``means`` float32 :math:`(N, 2)` and ``cholesky`` float32 :math:`(N, 3)` in pixels,
-    ``colors`` float32 :math:`(N, C)` with the opacities multiplied in, ``region_ids`` int64 :math:`(N)`, each a
-    position among the regions, and ``memberships`` float32 :math:`(R, H, W)`: how much of each pixel is each region's,
-    0 or 1 where contours are hard; without regions, ones of shape :math:`(1, H, W)` and zeros for ids. Output ``image``
-    float32 :math:`(1, C, H, W)`. All sizes vary. No operator scatters. Memory is that of the image and of 1,024 weights
-    for each Gaussian on a tile.
+    Convention: inputs are ``means`` float32 :math:`(N, 2)` and ``cholesky`` float32 :math:`(N, 3)` in pixels;
+    ``colors`` float32 :math:`(N, C)`, multiplied by the opacities; ``region_ids`` int64 :math:`(N)`, indices from 0 to
+    R - 1; and ``memberships`` float32 :math:`(R, H, W)`, the share of each region in each pixel, 0 or 1 for hard
+    contours. Without regions, pass ones of shape :math:`(1, H, W)`, and zeros as ids. The output is ``image`` float32
+    :math:`(1, C, H, W)`. All sizes vary. No operator scatters. Memory holds the image, and 1,024 weights for each
+    Gaussian on a tile.
 
     Args:
         cutoff: weights below it are skipped, as in :func:`kcgs.functional.region_splat`.
@@ -81,7 +81,7 @@ def generic_decoder(*, cutoff: float = 1e-4, clamp: bool = True) -> onnx.ModelPr
         gaussian = g.Compress(numbers, g.Squeeze(near, [0]), axis=0)  # [K]
         x, y, k1, slope, k2 = g.split(g.Unsqueeze(frame[gaussian], [2, 3]), 5, axis=1)  # [K, 1, 1, 1]
         offsets = np.arange(_SIDE, dtype=np.float32) - np.float32((_SIDE - 1) / 2)
-        # pixel minus mean before anything is multiplied: nothing cancels where a Gaussian is far below a pixel wide
+        # subtract the mean before all products: so Gaussians far thinner than a pixel have no cancellation
         dx, dy = (left - x) + offsets, (top - y) + offsets[:, None]
         z1, z2 = whiten(dx, dy, k1, slope, k2)
         weight = g.Flatten(weigh(g, -(z1 * z1 + z2 * z2), cutoff))

@@ -1,4 +1,4 @@
-"""An ONNX graph that is put together by arithmetic on its values, and closed to a checked model."""
+"""Build an ONNX graph by arithmetic on its values, and close it to a checked model."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import onnx_ir.passes.common as passes
 from numpy.typing import NDArray
 from onnx_ir.tape import Tape
 
-OPSET = 18  # the oldest that has all operators: more runtimes take it, and `onnx.version_converter` raises it
+OPSET = 18  # as in exports of Kornia
 _IR_VERSION = 10
 
 BOOL = ir.DataType.BOOL
@@ -22,14 +22,14 @@ FLOAT = ir.DataType.FLOAT
 INT32 = ir.DataType.INT32
 INT64 = ir.DataType.INT64
 
-# results of operators that are not of the type of the first operand, or of the second after a condition
+# dtypes of results; other operators have the dtype of their first operand, or of the second after a condition
 _RESULTS = {
     "Equal": BOOL,
     "Greater": BOOL,
     "Less": BOOL,
     "LessOrEqual": BOOL,
     "Shape": INT64,
-    "If": FLOAT,  # branches return images
+    "If": FLOAT,  # its branches return images
     "Loop": FLOAT,  # its turns return parts of an image
 }
 
@@ -37,7 +37,7 @@ Array = NDArray[np.generic]
 
 
 def _arithmetic(operator: str, reflected: bool = False) -> Callable[[Value, Operand], Value]:
-    """Return the method of a value that applies an operator to it and an operand, or to the operand and it."""
+    """Return a method of `Value` that applies an operator to the value and an operand; reflected: in reverse order."""
 
     def apply(self: Value, other: Operand) -> Value:
         if isinstance(other, int | float):
@@ -50,11 +50,11 @@ def _arithmetic(operator: str, reflected: bool = False) -> Callable[[Value, Oper
 class Value:
     """A tensor of a graph. Arithmetic adds operators to the graph; `x[i]` gathers along the first axis.
 
-    Numbers of Python take the type of the value. Division of integers rounds towards zero. Methods that are named as
-    torch's let formulas of `kcgs.maps` and `kcgs.kernels` take values.
+    Python numbers take the dtype of the value. Division of integers rounds towards zero. Methods with torch's names
+    allow formulas of `kcgs.maps` and `kcgs.kernels` to take values.
     """
 
-    __array_ufunc__ = None  # numpy leaves arithmetic of its arrays and values to this class
+    __array_ufunc__ = None  # numpy leaves arithmetic between its arrays and values to this class
 
     def __init__(self, graph: Graph, value: ir.Value, dtype: ir.DataType) -> None:
         self.graph = graph
@@ -91,28 +91,28 @@ class Value:
         return self.graph.Gather(self, indices)
 
     def astype(self, dtype: ir.DataType) -> Value:
-        """Cast to a type."""
+        """Cast to a dtype."""
         if dtype == self.dtype:
             return self
         return Value(self.graph, self.graph.Cast(self, to=dtype).value, dtype)
 
 
-# what an operator takes: lists are int64, and so are Python's integers; its floats are float32
+# operands of an operator: lists and Python integers become int64, Python floats become float32
 Operand = Value | Array | np.generic | int | float | Sequence[int]
 
 
 class Scope(NamedTuple):
-    """What belongs to a graph alone, and not to those inside it or around it."""
+    """The contents of a single graph, without graphs inside it or around it."""
 
     tape: Tape
     inputs: list[ir.Value]
-    constants: dict[tuple[str, tuple[int, ...], bytes], Value]  # onnx.compose renames no others inside a body
+    constants: dict[tuple[str, tuple[int, ...], bytes], Value]  # onnx.compose renames only a body's own constants in it
 
 
 class Graph:
-    """A graph in the making: `graph.Gather(x, indices, axis=1)` adds an operator and returns its result.
+    """A graph under construction: `graph.Gather(x, indices, axis=1)` adds an operator and returns its result.
 
-    Arrays become constants, stored once if equal.
+    Arrays become constants; equal arrays are stored once.
 
     Example:
         >>> graph = Graph()
@@ -127,7 +127,7 @@ class Graph:
         self._numbers = count(1)
 
     def __getattr__(self, operator: str) -> Callable[..., Value]:
-        """Return the operator of this name in ONNX, which has one result, as a method."""
+        """Return the ONNX operator of this name, with one result, as a method."""
         if not onnx.defs.has(operator):
             raise AttributeError(operator)
         return partial(self.apply, operator)
@@ -139,7 +139,7 @@ class Graph:
         return self.add_node(operator, values, [dtype], **attributes)[0]
 
     def input(self, name: str, dtype: ir.DataType, shape: Sequence[int | str], doc: str | None = None) -> Value:
-        """Declare an input; names stand for sizes that vary, `doc` says order, range and units."""
+        """Declare an input; names in `shape` are sizes that vary, `doc` describes order, range and units."""
         value = ir.val(name, dtype=dtype, shape=ir.Shape(list(shape)))
         value.doc_string = doc
         self._scopes[-1].inputs.append(value)
@@ -161,7 +161,7 @@ class Graph:
     def add_node(
         self, operator: str, operands: Sequence[Value], dtypes: Sequence[ir.DataType], **attributes: object
     ) -> list[Value]:
-        """Apply an operator whose results have these types."""
+        """Apply an operator whose results have these dtypes."""
         results = self._scopes[-1].tape.op_multi_out(
             operator,
             [operand.value for operand in operands],
@@ -172,31 +172,31 @@ class Graph:
             value.name = f"v{next(self._numbers)}"
         node = results[0].producer()
         assert node is not None
-        node.name = ""  # names of nodes are optional, and weigh as much as the nodes
+        node.name = ""  # names of nodes are optional, and take as many bytes as the nodes
         return [Value(self, value, dtype) for value, dtype in zip(results, dtypes, strict=True)]
 
     def split(self, value: Operand, parts: int | Sequence[int], axis: int = 0) -> list[Value]:
-        """Cut a value into so many equal parts, or into parts of these lengths."""
+        """Cut a value into a number of equal parts, or into parts of given lengths."""
         value = self.constant(value)
         if isinstance(parts, int):
             return self.add_node("Split", [value], [value.dtype] * parts, axis=axis, num_outputs=parts)
         return self.add_node("Split", [value, self.constant(parts)], [value.dtype] * len(parts), axis=axis)
 
     def argsort(self, numbers: Value, count: Operand, largest: int = 0) -> Value:
-        """Find the `count` smallest or largest numbers, int64 indices, in order; of equal ones, the first comes first.
+        """Return the int64 indices of the `count` smallest or largest numbers, sorted; equal numbers keep their order.
 
-        So it finds flags, too: onnxruntime would leave Compress for every run.
+        It also finds flags that are set: onnxruntime would compute Compress in every run, not on loading.
         """
         operands = [numbers.astype(INT64), self.constant(count)]
         return self.add_node("TopK", operands, [INT64, INT64], largest=largest, axis=0)[1]
 
     def body(self, name: str, build: Callable[[], Sequence[Value]]) -> ir.Graph:
-        """Make the graph inside a Loop or an If: what `build` adds and returns; it may use values from outside."""
+        """Make the body of a Loop or an If from what `build` adds and returns; it may use values from outside."""
         self._scopes.append(Scope(Tape(), [], {}))
         return self._pop(name, build(), {})
 
     def choose(self, condition: Value, first: Callable[[], Value], second: Callable[[], Value]) -> Value:
-        """Compute the first value where a condition, (1,), holds, and else the second."""
+        """Compute the first value if a condition, (1,), holds, else the second."""
         then, other = self.body("then", lambda: [first()]), self.body("else", lambda: [second()])
         return self.If(condition, then_branch=then, else_branch=other)
 
@@ -210,14 +210,14 @@ class Graph:
         graph_doc: str = "",
         metadata: Mapping[str, str] | None = None,
     ) -> onnx.ModelProto:
-        """Close the graph with its output, and check it; `doc` says what the output is."""
+        """Close the graph with its output, and check the model; `doc` describes the output."""
         value = output.value
         value.name, value.dtype, value.shape, value.doc_string = name, output.dtype, ir.Shape(list(shape)), doc
         graph = self._pop("decoder", [output], {"": OPSET})
         graph.doc_string = graph_doc
         model = ir.Model(graph, ir_version=_IR_VERSION, producer_name="kcgs")
         model.metadata_props.update(metadata or {})
-        passes.RemoveUnusedNodesPass()(model)  # modules make what only some scenes need, such as sums of squares
+        passes.RemoveUnusedNodesPass()(model)  # modules also make values that only some scenes need
         proto = ir.to_proto(model)
         onnx.checker.check_model(proto, full_check=True)
         return proto

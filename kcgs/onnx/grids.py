@@ -1,7 +1,7 @@
 """Wide Gaussians: evaluated at the nodes of coarse grids, and interpolated at the pixels by cubic B-splines.
 
-The grids are those of the scene at any size of the output, so that their nodes are evaluated when the decoder is
-loaded. The output reads the finest grid, whose nodes are two pixels apart. Blocks lie in memory column by column.
+The grids do not depend on the size of the output, so that their nodes are evaluated on loading. The output reads the
+finest grid, whose nodes are two pixels apart. Blocks are stored by columns.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from .tables import NodeTable
 from .weights import monomials, weigh
 
 _HALF = TILE // 2
-# eighths of the nodes of a coarser grid in a finer one: node 2 i lies between nodes i and i + 1 of a window, node
-# 2 i + 1 at i + 1
+# weights, in eighths, of the nodes of a coarse grid at a node of the finer grid: node 2 i is between nodes i and i + 1
+# of a window, node 2 i + 1 is at node i + 1
 _REFINE = ((4, 4, 0), (1, 6, 1))
 
 
 class CoarseGrids:
-    """Samples the nodes at the pixels of blocks, whose rows and columns are `down` and `across`."""
+    """Sample the nodes at the pixels of blocks; `down` has their rows, `across` their columns."""
 
     def __init__(self, storage: Storage, table: NodeTable, down: Axis, across: Axis, cutoff: float) -> None:
         self.graph = storage.graph
@@ -37,7 +37,7 @@ class CoarseGrids:
         self.quarters = self._refine(self._evaluate(cutoff))  # [4 n + 1, C, 8, 8], of the finest grid's blocks
 
     def image(self) -> Value:
-        """Sample tiles of one region, (C, V, pieces * side, width) with pixels to spare; the others are zero."""
+        """Sample tiles of one region, (C, V, pieces * side, width) with spare pixels; other tiles are zero."""
         g, tiles, channels = self.graph, self.storage.plan.tiles, self.storage.channels
         no_region = self.table.nodes.no_region
         regions = [no_region if number in tiles.several else ids[0] for number, ids in enumerate(tiles.regions)]
@@ -45,7 +45,7 @@ class CoarseGrids:
         values = self._window(region, g.Range(np.int32(0), np.int32(len(regions)), np.int32(1)))
         values = g.Reshape(values, [tiles.rows, tiles.cols, channels, NODES, NODES])
         values = g.Gather(values[self.down.tile], self.across.tile, axis=1)
-        # [tile column, node, (C, tile row, node)]: what is beyond the tile column is multiplied at once
+        # [tile column, node, (C, tile row, node)]: one matrix product for each tile column
         values = g.Transpose(values, perm=[1, 3, 2, 0, 4])
         values = g.Reshape(values, g.Concat(g.Shape(self.across.tile), [NODES, -1], axis=0))
         columns = g.Reshape(self.places.columns, [0, -1, NODES]) @ values
@@ -54,7 +54,7 @@ class CoarseGrids:
         return g.Reshape(self.down_spline, [0, -1, NODES]) @ columns
 
     def blocks(self, count: int, regions: Value, slots: Value, row: Value, col: Value) -> Value:
-        """Sample the blocks of tiles with K regions, (T, K), to (T, blocks, K, C, P), column by column."""
+        """Sample the blocks of tiles with K regions, (T, K), to (T, blocks, K, C, P), stored by columns."""
         g, channels = self.graph, self.storage.channels
         tiles = [part.tiles for part in self.storage.entries if part.group.regions == count]
         tile = g.Expand(g.Unsqueeze(g.Concat(*tiles, axis=0), [1]), g.Shape(regions))
@@ -64,7 +64,7 @@ class CoarseGrids:
         return self.places.blocks(windows[slots], row, col, (count, channels))
 
     def _window(self, region: Value, tile: Value) -> Value:
-        """Return the nodes that tiles (n,) read, (n, C, column, row); those of hidden regions are zero."""
+        """Return the nodes that tiles (n,) read, (n, C, column, row); nodes of hidden regions are zero."""
         g, cols = self.graph, self.storage.plan.tiles.cols
         quarters = self._find_quarters(np.int32(0), region, tile // cols, tile % cols)
         nodes = self._join(self.quarters, quarters, 0)
@@ -84,7 +84,7 @@ class CoarseGrids:
         for part in entries:
             weights = weigh(g, part.shaped_coefficients() @ basis, cutoff)
             values.append(part.shaped_colors() @ weights)
-        # the last is for blocks that are only refined
+        # the last block, of zeros, is for blocks without Gaussians of their own: they are only refined
         values.append(g.Expand(np.float32(0), [1, channels, TILE * TILE]))
         first = len(plan.tiles.regions)
         rank = g.Slice(self.storage.slots.rank, [first], [plan.num_blocks])
@@ -93,7 +93,7 @@ class CoarseGrids:
         return g.Concat(*values, axis=0)[g.Min(rank - tiles, np.int32(last))]
 
     def _refine(self, values: Value) -> Value:
-        """Add to each grid the next coarser one, interpolated; return the quarters of the finest one's blocks."""
+        """Add to each grid the interpolated next coarser grid; return the quarters of the finest grid's blocks."""
         g, channels, table = self.graph, self.storage.channels, self.table
         counts = np.bincount(table.nodes.place[:, 0]).tolist()
         ids = self._find_quarters(table.level + 1, table.region, table.row, table.col)
@@ -117,9 +117,9 @@ class CoarseGrids:
         return quarters
 
     def _find_quarters(self, level: Value | np.int32, region: Value, row: Value, col: Value) -> Value:
-        """Find the quarters of blocks of a level under blocks (n,) of the next finer one, down and across, (n, 2, 2).
+        """Find the quarters of a level's blocks under blocks (n,) of the next finer level, down and across, (n, 2, 2).
 
-        A block covers two by two quarters; the first is that of its own row and column.
+        A block covers two by two quarters of the level; the first quarter has the row and column of the block.
         """
         g, (_, regions, rows, cols) = self.graph, self.table.nodes.shape
         two = g.constant(np.arange(2, dtype=np.int32))
@@ -133,7 +133,7 @@ class CoarseGrids:
         return self.table.block[key] * 4 + quarter
 
     def _join(self, quarters: Value, ids: Value, first: int) -> Value:
-        """Join quarters, (n, 2, 2), of blocks from `first` on, to (n, C, 16, 16); the last quarter is zero."""
+        """Join quarters `ids`, (n, 2, 2), of blocks from `first` on, to (n, C, 16, 16); the last quarter is zero."""
         g = self.graph
         last = g.Shape(quarters, end=1).astype(INT32) - 1
         place = g.Min(ids - 4 * first, last)

@@ -1,4 +1,4 @@
-"""Groups of tiles, for `plan`: their lists of Gaussians are of similar length, and they are rendered at once."""
+"""Groups of tiles, for `plan`: tiles whose lists of Gaussians have similar lengths are rendered at once."""
 
 from __future__ import annotations
 
@@ -11,36 +11,36 @@ from .tiles import Tiles
 
 Integers = NDArray[np.int64]
 
-# what one more group costs, in entries of lists: fewer groups are fewer operators, more groups are lists with fewer
-# entries that only fill them up. Tune it by the times of `python -m benchmarks decode`
+# cost of one more group, in entries of lists: higher: fewer groups and operators; lower: less padding of lists. Tune it
+# by the times of `python -m benchmarks decode`
 _GROUP_COST = 300
-# entries of a group at most: the weights of more, 1 kB of an entry, do not stay in a core's cache
+# most entries of a group: the weights of more entries, 1 kB each, do not stay in a core's cache
 _MOST_ENTRIES = 4096
-# the same of a group of blocks of nodes, which is evaluated only when a decoder is loaded
+# cost of one more group of blocks of nodes, in entries of lists; it is higher since nodes are evaluated only on loading
 _NODE_GROUP_COST = 4000
 
 
 class Group(NamedTuple):
-    """Tiles, or blocks of nodes, that are rendered together; lists are filled up to the longest with their last."""
+    """Tiles, or blocks of nodes, that are rendered together; lists are padded to the longest by their last Gaussian."""
 
-    tiles: Integers  # [T], ascending; blocks of nodes are numbered behind the tiles
-    lengths: Integers  # [T]
-    regions: int  # of a tile, K; 1: nothing is weighed by membership
+    tiles: Integers  # [T], ascending; the numbers of blocks of nodes come after those of tiles
+    lengths: Integers  # [T], Gaussians in each list
+    regions: int  # regions of a tile, K; 1: without memberships
     narrow: bool  # whether to sum squares in place of a polynomial
     nodes: bool  # whether these are blocks of nodes
 
     @property
     def longest(self) -> int:
-        """Length that all lists are filled up to, L."""
+        """Length to which all lists are padded, L."""
         return max(1, int(self.lengths.max()))
 
 
 def group_tiles(pairs: Integers, is_narrow: NDArray[np.bool_], tiles: Tiles, num_nodes: int) -> list[Group]:
-    """Sort tiles into groups so that little is filled up and there are few groups; those of nodes come last.
+    """Sort tiles into few groups with little padding; groups of blocks of nodes come last.
 
     Args:
-        pairs: (2, P), Gaussian and tile.
-        is_narrow: of every Gaussian.
+        pairs: Gaussian and tile, (2, P).
+        is_narrow: flag of every Gaussian.
         tiles: of the scene.
         num_nodes: number of blocks of nodes.
     """
@@ -50,9 +50,9 @@ def group_tiles(pairs: Integers, is_narrow: NDArray[np.bool_], tiles: Tiles, num
     kinds: dict[tuple[bool, int, bool], list[tuple[int, int]]] = {}
     for number, length in enumerate(lengths.tolist()):
         regions = len(tiles.regions[number]) if number in tiles.several else 1
-        # a tile with several regions needs a list for what comes from coarser grids, too
+        # with coarse grids, a tile with several regions needs a list even if it is empty
         if length or (num_nodes and regions > 1):
-            # few kinds: numbers of regions rise by powers of two
+            # powers of two as numbers of regions: few kinds
             kind = (number >= count, 1 << (regions - 1).bit_length(), bool(narrow_lengths[number]))
             kinds.setdefault(kind, []).append((length, number))
     groups = []
@@ -64,7 +64,7 @@ def group_tiles(pairs: Integers, is_narrow: NDArray[np.bool_], tiles: Tiles, num
 
 
 def _split_by_length(lists: list[tuple[int, int]], group_cost: int) -> list[list[tuple[int, int]]]:
-    """Cut the lists, sorted by their lengths, where that costs least: the best cuts by dynamic programming."""
+    """Cut the lists, sorted by length, into parts of the least total cost, by dynamic programming."""
     lengths, first = np.unique([length for length, _ in lists], return_index=True)
     ends = [*first[1:].tolist(), len(lists)]
     best, cut = [0.0], [0]

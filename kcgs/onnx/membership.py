@@ -1,4 +1,4 @@
-"""The membership of a block's pixels, sampled from the window of its tile: a factor that `blocks` multiplies."""
+"""The memberships at a block's pixels, sampled from the window of its tile: factors on the colours of `blocks`."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from .graph import Graph, Value
 from .tiles import WINDOW
 from .windows import pack_windows, split_tiles, stored_windows, tile_ids
 
-# pixels that a contour may reach where its blur is computed in the graph
+# largest reach of a contour, in pixels, whose blur is computed in the graph
 _FARTHEST = 16
-# least weight of a region at a pixel: its logarithm is finite
+# least weight of a region at a pixel, so that its logarithm is finite
 _TINY = 1e-6
 
 
 def make_membership(storage: Storage, down: Axis, across: Axis) -> MembershipSampler | None:
-    """Store the windows of a map; None where no tile has several regions."""
+    """Store the windows of a map; return None if no tile has several regions."""
     g, tiles, tiles_of = storage.graph, storage.plan.tiles, storage.plan.mixed_tiles
     membership, smooth = tiles.membership, tiles.smooth
     if not tiles_of or membership is None or smooth is None:
@@ -48,14 +48,14 @@ def make_membership(storage: Storage, down: Axis, across: Axis) -> MembershipSam
 
 
 class MembershipSampler:
-    """Samples the memberships in the blocks of tiles with several regions, as :class:`kcgs.maps.Resampled` has it.
+    """Sample the memberships in the blocks of tiles with several regions, as :class:`kcgs.maps.Resampled` does.
 
     Args:
         g: the graph.
         places: interpolates windows.
-        windows: makes those of the tiles with K regions, (T, K, S, S): the memberships at the size of the scene.
-        smooth_windows: makes the weights that are interpolated for other sizes.
-        exponent: of the samples in the blocks of tiles.
+        windows: returns the memberships of tiles with K regions at the size of the scene, (T, K, S, S).
+        smooth_windows: returns the weights that are interpolated for other sizes.
+        exponent: returns the exponent of the samples in the blocks of tiles.
     """
 
     def __init__(
@@ -70,9 +70,9 @@ class MembershipSampler:
         self.windows, self.smooth_windows = windows, smooth_windows
 
     def blocks(self, count: int, slots: Value, row: Value, col: Value) -> Value:
-        """Sample the memberships in the blocks of tiles with K regions, (T, blocks, K, 1, P), column by column.
+        """Sample the memberships in the blocks of tiles with K regions, (T, blocks, K, 1, P), stored by columns.
 
-        `slots`, (T,), are the places of the tiles among those, `row` and `col`, (T,), those among rows and columns.
+        `slots`, (T,), are indices among the tiles with K regions; `row` and `col`, (T,), are those of the tiles.
         """
         g, places = self.graph, self.places
         windows, smooth_windows = self.windows(count)[slots], self.smooth_windows(count)[slots]
@@ -91,7 +91,7 @@ class MembershipSampler:
 
 
 def _sharpen(g: Graph, samples: Value, exponent: Value) -> Value:
-    """Raise the samples of each pixel to a power, and let them sum to one."""
+    """Raise the samples of each pixel to a power, and normalise them to a sum of 1."""
     samples = g.Max(samples, _TINY)
     ratios = samples / g.ReduceMax(samples, [2], keepdims=1)
     powers = g.Exp(g.Log(ratios) * exponent)  # Pow takes four times as long

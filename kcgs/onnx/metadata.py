@@ -21,7 +21,7 @@ def describe_decoder(model: onnx.ModelProto) -> dict[str, object]:
         model: made by :func:`kcgs.onnx.scene_decoder` or :func:`kcgs.onnx.generic_decoder`.
 
     Returns:
-        The metadata; the list of region ids as a list.
+        The metadata by name, as strings; the region ids as a list.
 
     Example:
         >>> from kcgs import GaussianField
@@ -37,7 +37,7 @@ def describe_decoder(model: onnx.ModelProto) -> dict[str, object]:
 
 
 def decoder_metadata(kind: str, cutoff: float, clamp: bool) -> dict[str, str]:
-    """Metadata of every decoder."""
+    """Return the metadata of every decoder."""
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -49,7 +49,7 @@ def decoder_metadata(kind: str, cutoff: float, clamp: bool) -> dict[str, str]:
 
 
 def scene_metadata(scene: Scene, *, cutoff: float, clamp: bool) -> dict[str, str]:
-    """Metadata of a scene's decoder."""
+    """Return the metadata of a scene's decoder."""
     field, regions = scene.field, scene.regions
     count = 1 if regions is None else regions.num_regions
     contours = "none" if regions is None or count == 1 else "hard" if regions.softness == 0.0 else "soft"

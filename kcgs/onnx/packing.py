@@ -1,4 +1,4 @@
-"""Integer constants in few bytes, and the operators that unfold them to int32 at loading. All modules store by it."""
+"""Integer constants in few bytes, and the operators that unfold them to int32 on loading."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from numpy.typing import NDArray
 
 from .graph import INT32, Graph, Value
 
-# bytes of the operators that unfold a sparse constant: a sparse constant must save more
+# bytes of the operators that unfold a sparse constant, which must save more than this
 _SPARSE_COST = 500
 
 
 def pack_integers(g: Graph, numbers: NDArray[np.int64]) -> Value:
-    """Store integers from 0 on in one, two or four bytes each.
+    """Store integers of 0 or more in one, two or four bytes each.
 
-    Two bytes are stored as such, low and high: not all runtimes have 16-bit types.
+    Two bytes are stored as two arrays, low and high bytes: some runtimes have no 16-bit types.
     """
     largest = int(numbers.max(initial=0))
     if largest >= 1 << 16:
@@ -27,7 +27,7 @@ def pack_integers(g: Graph, numbers: NDArray[np.int64]) -> Value:
 
 
 def pack_sparse(g: Graph, numbers: NDArray[np.int64]) -> Value:
-    """Store integers (n,) of which most are 0: flags of the others, and those."""
+    """Store integers (n,) that are mostly 0: a flag for each, and the numbers that are not 0."""
     used = numbers > 0
     size = 1 if numbers.max(initial=0) < 256 else 2
     if size * used.sum() + len(numbers) // 8 + _SPARSE_COST > size * len(numbers):
@@ -38,14 +38,14 @@ def pack_sparse(g: Graph, numbers: NDArray[np.int64]) -> Value:
 
 
 def pack_flags(g: Graph, flags: NDArray[np.bool_]) -> Value:
-    """Store flags (n,) as bits, and where few are set, sparser."""
+    """Store flags (n,) as bits; bytes of bits are stored sparsely if few flags are set."""
     octets = pack_sparse(g, np.packbits(flags, bitorder="little").astype(np.int64))
     bits = g.Unsqueeze(octets, [1]) // (1 << np.arange(8)).astype(np.int32)
     return g.Slice(g.Reshape(bits % 2, [-1]), [0], [len(flags)], [0])
 
 
 def pack_runs(g: Graph, numbers: NDArray[np.int64]) -> Value:
-    """Store integers (n,) that are often the same as the one before: where they change, and to what."""
+    """Store integers (n,) that often equal the integer before: flags of changes, and the new numbers."""
     changes = np.diff(numbers, prepend=-1) != 0
     run = g.CumSum(pack_flags(g, changes), 0) - 1
     return pack_integers(g, numbers[changes])[run]

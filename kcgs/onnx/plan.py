@@ -1,4 +1,4 @@
-"""The plan of a decoder: what it stores of a scene, and what is rendered where. Nothing here knows ONNX."""
+"""The plan of a decoder, without ONNX: the Gaussians that it stores, and the tiles in which they are rendered."""
 
 from __future__ import annotations
 
@@ -19,45 +19,45 @@ from .groups import Group, Integers, group_tiles
 from .reach import pair_with_blocks, place_gaussians
 from .tiles import Tiles, find_tiles
 
-# what coarse grids cost, in entries of lists, which they must save. Tune both by the times of
+# cost of coarse grids, in entries of lists: they must save more entries. Tune both by the times of
 # `python -m benchmarks decode`
-_GRIDS_COST = 2000  # whatever they hold
-_SPLINE_COST = 7  # for each tile and region
-# deviation in pixels below which the rounding of a polynomial would show in log w, so that squares are summed
+_GRIDS_COST = 2000  # constant cost
+_SPLINE_COST = 7  # cost of each pair of tile and region
+# Gaussians with a smaller standard deviation, in pixels, sum squares: the rounding of a polynomial log w would show
 _NARROW = 0.15
-_NARROW_OF_FAINT = 0.4  # where weights below _FAINT are rendered, too
+_NARROW_OF_FAINT = 0.4  # if weights below _FAINT are rendered too
 _FAINT = 1e-5
 
 Floats = NDArray[np.float32]
 
 
 class GaussianTable(NamedTuple):
-    """The Gaussians that reach a pixel; those of coarser grids in units of their nodes."""
+    """The Gaussians that reach a pixel; on coarse grids in units of the nodes' spacing."""
 
     means: Floats  # [N, 2]
     cholesky: Floats  # [N, 3]
     colors: Floats  # [N, C], opacities merged
-    region: Integers  # [N], position in the map
+    region: Integers  # [N], index of the region in the map
 
 
 class NodeBlocks(NamedTuple):
-    """The blocks of coarser grids where anything is, and the table of all that there may be."""
+    """The blocks of coarse grids that some Gaussian reaches, and the shape of the table of all possible blocks."""
 
     place: Integers  # [n, 4] level - 1, region, row and column, ascending
-    shape: tuple[int, int, int, int]  # one level more than there are, one region more: nothing is there
+    shape: tuple[int, int, int, int]  # levels, regions, rows, columns; with one empty level and one empty region more
 
     @property
     def no_region(self) -> int:
-        """Position of the region that has no nodes."""
+        """Index of the region without nodes."""
         return self.shape[1] - 1
 
 
 class DecoderPlan(NamedTuple):
-    """All that a decoder stores."""
+    """The contents of a decoder."""
 
     tiles: Tiles
     gaussians: GaussianTable
-    groups: list[Group]  # those of nodes last
+    groups: list[Group]  # groups of blocks of nodes come last
     pairs: Integers  # [2, P] Gaussian and tile of every entry, in this order
     nodes: NodeBlocks | None  # None: no coarser grids
 
@@ -68,19 +68,19 @@ class DecoderPlan(NamedTuple):
 
     @property
     def mixed_tiles(self) -> dict[int, Integers]:
-        """Tiles with several regions, (T,), in the order of groups, by their number of regions."""
+        """Tiles with several regions by their number of regions: (T,) each, in the order of groups."""
         kinds = sorted({group.regions for group in self.groups} - {1})
         parts = {kind: [group.tiles for group in self.groups if group.regions == kind] for kind in kinds}
         return {kind: np.concatenate(tiles) for kind, tiles in parts.items()}
 
     @property
     def pixel_groups(self) -> list[Group]:
-        """The groups of tiles."""
+        """The groups of tiles, without those of blocks of nodes."""
         return [group for group in self.groups if not group.nodes]
 
 
 def plan_decoder(field: GaussianField, regions: RegionMap | None, cutoff: float) -> DecoderPlan:
-    """Find what is rendered where, and group it."""
+    """Find the Gaussians that reach each tile or block of nodes, and group the tiles and blocks."""
     tiles = find_tiles(regions, field.size)
     num_regions = 1 if regions is None else regions.num_regions
     region = torch.zeros(field.num_gaussians, dtype=torch.int64)
@@ -108,7 +108,7 @@ def plan_decoder(field: GaussianField, regions: RegionMap | None, cutoff: float)
 def _pair(
     field: GaussianField, region: Tensor, num_regions: int, blocks: Blocks, cutoff: float
 ) -> tuple[Coarsened, Tensor, Tensor]:
-    """Pair Gaussians with blocks of pixels, or, if that saves enough of them, wide ones with blocks of nodes."""
+    """Pair Gaussians with blocks of pixels; pair wide Gaussians with blocks of nodes if this saves enough pairs."""
     means, cholesky = (t.detach().double().cpu() for t in (field.means, field.cholesky))
     fine = place_gaussians(means, cholesky, cutoff, 1)
     gaussian, block = pair_with_blocks(fine, region, num_regions, blocks, cutoff)
@@ -120,7 +120,7 @@ def _pair(
 
 
 def _number_blocks(blocks: Blocks, num_regions: int, tiles: Tiles, block: Tensor) -> tuple[NodeBlocks | None, Tensor]:
-    """Return the blocks of nodes where anything is, and the numbers of all blocks."""
+    """Return the blocks of nodes that Gaussians reach, directly or through coarser blocks, and all blocks' numbers."""
     number, levels = torch.from_numpy(blocks.tiles), blocks.levels
     is_needed = torch.zeros(len(number) + 1, dtype=torch.bool)
     is_needed[block] = True
@@ -140,7 +140,7 @@ def _number_blocks(blocks: Blocks, num_regions: int, tiles: Tiles, block: Tensor
 
 
 def _in_raster_order(coarsened: Coarsened, ids: Tensor) -> Tensor:
-    """Sort ids by level and tile: neighbours get neighbouring numbers, so that lists are stored as small steps."""
+    """Sort ids by level and tile, so that neighbours have similar numbers and lists are stored as small steps."""
     if len(ids) == 0:
         return ids
     column, row = (coarsened.means[ids] / TILE).floor().unbind(-1)
@@ -149,7 +149,7 @@ def _in_raster_order(coarsened: Coarsened, ids: Tensor) -> Tensor:
 
 
 def _is_narrow(cholesky: Floats, width: float) -> NDArray[np.bool_]:
-    """Find Gaussians that are narrower than a width in some direction."""
+    """Return the mask of the Gaussians that are narrower than `width` in some direction."""
     l11, l21, l22 = cholesky.astype(np.float64).T
     steepest: NDArray[np.float64] = np.hypot(np.hypot(1 / l11, l21 / (l11 * l22)), 1 / l22)
     return steepest * width > 1

@@ -1,4 +1,4 @@
-"""Tables that `entries` makes: the group and place that each tile is rendered at, and the blocks of nodes."""
+"""Tables for `entries`: the group and the place in it of each tile, and the blocks of nodes."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from .plan import DecoderPlan, NodeBlocks
 
 
 class Slots(NamedTuple):
-    """Where the n tiles and blocks of nodes are rendered, int32; groups and their tiles are numbered one by one."""
+    """The places of n tiles and blocks of nodes in groups, int32."""
 
-    group: Value  # (n,), the number of groups where nothing is rendered
+    group: Value  # (n,), number of the group; for tiles without Gaussians the count of groups
     slot: Value  # (n,), place among the tiles of the group
     rank: Value  # (n,), place among the tiles of all groups
     tiles: list[Value]  # of each group, (T,)
@@ -36,10 +36,10 @@ def make_slots(g: Graph, plan: DecoderPlan) -> Slots:
 
 
 class NodeTable(NamedTuple):
-    """The n blocks of nodes, int32, and which of them lies where."""
+    """The n blocks of nodes, int32, and a table from places to blocks."""
 
     nodes: NodeBlocks
-    block: Value  # of each level, region, row and column; n, a block of zeros, where there is none
+    block: Value  # block at each level, region, row and column; if there is none, n, a block of zeros
     level: Value  # (n,), from 0 for the finest grid
     region: Value  # (n,)
     row: Value  # (n,)
@@ -47,7 +47,7 @@ class NodeTable(NamedTuple):
 
 
 def make_node_table(g: Graph, nodes: NodeBlocks) -> NodeTable:
-    """Store the blocks of nodes as flags, and unfold them."""
+    """Store the blocks of nodes as flags of places, and unfold them."""
     count = len(nodes.place)
     flags = np.zeros(nodes.shape, np.bool_)
     flags[tuple(nodes.place.T)] = True
@@ -62,5 +62,5 @@ def make_node_table(g: Graph, nodes: NodeBlocks) -> NodeTable:
 
 
 def argsort(g: Graph, numbers: Value, count: int, largest: int = 0) -> Value:
-    """Find the `count` smallest or largest numbers: int32 indices."""
+    """Return the int32 indices of the `count` smallest or largest numbers."""
     return g.argsort(numbers, [count], largest).astype(INT32)

@@ -1,4 +1,4 @@
-"""The tiles of a scene, for `plan`: the regions of each, and the labels or memberships of the pixels around it."""
+"""The tiles of a scene, for `plan`: the regions of each tile, and the memberships of the pixels around it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from kcgs.maps import (
     table_and_size,
 )
 
-# side of a window: a tile and the pixels around it, those of the border of the scene repeated beyond it
+# side of a window: a tile and the pixels around it; outside the scene, pixels of its border are repeated
 WINDOW = TILE + 2
 
 
@@ -27,10 +27,10 @@ class Tiles(NamedTuple):
 
     rows: int
     cols: int
-    regions: list[list[int]]  # of each tile, positions in the map: those with any membership in its window
+    regions: list[list[int]]  # of each tile, indices of the regions that have membership in its window
     several: set[int]  # tiles with several regions
     membership: Membership | None = None  # at the size of the scene
-    smooth: SmoothMembership | None = None  # what is interpolated between its pixels
+    smooth: SmoothMembership | None = None  # memberships that are interpolated between pixels
 
 
 def find_tiles(regions: RegionMap | None, size: tuple[int, int]) -> Tiles:
@@ -40,7 +40,7 @@ def find_tiles(regions: RegionMap | None, size: tuple[int, int]) -> Tiles:
         return Tiles(rows, cols, [[0]] * (rows * cols), set())
     membership = membership_at(*table_and_size(regions))
     smooth = SmoothMembership(membership)
-    # a window reaches into the tiles around it
+    # windows extend into neighbouring tiles
     numbers = torch.arange(rows * cols)
     tile, region = find_windows(smooth.tiled_table, _corners(numbers, cols), (WINDOW, WINDOW))
     mixed = torch.bincount(tile)[tile] > 1
@@ -55,12 +55,12 @@ def find_tiles(regions: RegionMap | None, size: tuple[int, int]) -> Tiles:
 
 
 def _corners(tile: Tensor, cols: int) -> Tensor:
-    """Return map, first row and first column of the windows of tiles, (T, 3)."""
+    """Return the map's index (0), first row and first column of the windows of tiles, (T, 3)."""
     return torch.stack([torch.zeros_like(tile), tile // cols * TILE - 1, tile % cols * TILE - 1], 1)
 
 
 def read_memberships(membership: Membership, tile: Tensor, cols: int, region: Tensor) -> Tensor:
-    """Read a region over the window of a tile, (P, WINDOW, WINDOW), for P pairs of both."""
+    """Read memberships over windows, (P, WINDOW, WINDOW), for P pairs of tile and region."""
     corners = _corners(tile, cols)
     weights = cut_windows(membership.tiled_table, corners, region, (WINDOW, WINDOW))
     down, across = (

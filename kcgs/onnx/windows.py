@@ -1,4 +1,4 @@
-"""Windows, tiles and the pixels around them, as integers, and those of very wide contours. Made for `membership`."""
+"""Windows (tiles with the pixels around them), for `membership`: integers, and memberships of very wide contours."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from .groups import Integers
 from .packing import pack_integers, pack_runs
 from .tiles import Tiles, read_memberships
 
-# steps up to the largest weight that windows of wide contours are stored in: two bytes
+# number of steps of the stored weights of wide contours, up to the largest weight: two bytes
 _STEPS = (1 << 16) - 1
 
 
 def stored_windows(
     g: Graph, membership: Membership, tiles: Tiles, tiles_of: Mapping[int, Integers]
 ) -> Callable[[int], Value]:
-    """Store windows of contours that are too wide to be blurred in the graph, and return what gives them."""
+    """Return a function that stores windows of contours too wide for a blur in the graph, by the number of regions."""
 
     def unfold(count: int) -> Value:
         ids = tiles_of[count].tolist()
@@ -38,16 +38,16 @@ def stored_windows(
 
 
 def tile_ids(tiles_of: Mapping[int, Integers]) -> Integers:
-    """Tiles with several regions, (T,)."""
+    """Return the tiles with several regions, (T,)."""
     return np.concatenate([*tiles_of.values()])
 
 
 def split_tiles(g: Graph, tiles_of: Mapping[int, Integers], values: Value) -> dict[int, Value]:
-    """Cut values of all tiles, (T, ...), by the number of regions."""
+    """Split values of all tiles, (T, ...), by the number of regions."""
     lengths = [len(tiles) for tiles in tiles_of.values()]
     return dict(zip(tiles_of, g.split(values, lengths), strict=True))
 
 
 def pack_windows(g: Graph, windows: Integers) -> Value:
-    """Store integers (T, S, S), column by column."""
+    """Store integers (T, S, S) of windows by columns."""
     return g.Reshape(pack_runs(g, windows.swapaxes(1, 2).ravel()), windows.shape)
