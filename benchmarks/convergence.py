@@ -8,7 +8,7 @@ from statistics import fmean
 from .core.compare import Comparison, differences, group_by, losses_table, means_table, values_of
 from .core.figures import Panel, save_lines
 from .core.fits import METHODS, QUICK_ITERATIONS, figures, fit_for, method_of, timed_fit
-from .core.images import STITCHED, choose, load_mapped
+from .core.images import choose, load_mapped
 from .core.run import RESULTS_FILE, Job, Options, Page, Row, read_rows
 from .gpu_fit import GPU
 
@@ -18,17 +18,11 @@ NUM_GAUSSIANS = 1_250
 REPORT_OF_GPU = Path(__file__).parent / "reports/gpu-fit" / RESULTS_FILE
 BUDGETS = (2, 5, 15, 60)  # seconds of a core
 QUANTITIES = ("psnr", "ef_psnr")
-# photos of Kodak side by side, of 0.8, 3.1 and 12.6 megapixels; seconds of the clock, and number of Gaussians
-CLOCKS = {"1 x 2 photos": 20, "2 x 4 photos": 20, "4 x 8 photos": 60}
-CLOCK_COUNT = 1_000
-CLOCK_METHODS = ("best", "best-baseline")
 CASES = ["budget"]
 COMPARISONS = tuple(Comparison("best", other) for other in OTHERS)
 METHOD = f"""First frames of DAVIS with the given masks, N = {NUM_GAUSSIANS:,}. Each point is a fit of its own, which
 is planned for that time on one core: two short fits tell how long an iteration takes, and schedules are shortened by
 the recipes' own rule. Compilation is not in the times. Table: PSNR / EF-PSNR in dB."""
-METHOD_OF_CLOCKS = f""" Large photos are photos of Kodak side by side, with the map of `segment`, N = {CLOCK_COUNT:,},
-and `max_seconds` on one core."""
 METHOD_OF_GPU = f""" `{GPU}` is a fit of 700 iterations, measured for the report of `gpu-fit`: its seconds are those of
 the call on a GPU."""
 
@@ -36,10 +30,7 @@ the call on a GPU."""
 def measure(image: str, method: str, n: int, data: str, quick: bool) -> list[Row]:
     """Fit in each budget."""
     pixels, labels = load_mapped(image, data, quick)
-    rows: list[Row] = []
-    if image in CLOCKS:
-        result, seconds = timed_fit(pixels, labels, n, (method, {"max_seconds": CLOCKS[image]}))
-        return [{"image": image, "method": method, "budget": CLOCKS[image], **figures(result, seconds, pixels, labels)}]
+    rows = []
     for budget in BUDGETS:
         if quick:
             result, seconds = timed_fit(pixels, labels, n, method_of(method, QUICK_ITERATIONS + budget))
@@ -54,10 +45,7 @@ def jobs(options: Options) -> list[Job]:
     """Fit frames of DAVIS; without data, photos of scikit-image."""
     images = choose(options, "davis")
     n = 40 if options.quick else NUM_GAUSSIANS
-    pairs = [(image, method, n) for image in images for method in METHODS]
-    if not options.quick and options.data is not None:
-        pairs += [(image, method, CLOCK_COUNT) for image in CLOCKS for method in CLOCK_METHODS]
-    return [{"image": i, "method": m, "n": count, **options.image_arguments()} for i, m, count in pairs]
+    return [{"image": i, "method": m, "n": n, **options.image_arguments()} for i in images for m in METHODS]
 
 
 def rows_of_gpu(images: set[str]) -> list[Row]:
@@ -67,24 +55,8 @@ def rows_of_gpu(images: set[str]) -> list[Row]:
     return [{**row, "budget": 0, "core_seconds": row["seconds"]} for row in rows]
 
 
-def _describe_clocks(rows: list[Row]) -> str:
-    """Say what regions gain within the time, by megapixels."""
-    psnr = {(row["image"], row["method"]): row["psnr"] for row in rows}
-    best, plain = CLOCK_METHODS
-    parts = []
-    for image, seconds in CLOCKS.items():
-        if not {(image, best), (image, plain)} <= psnr.keys():  # of an interrupted run
-            continue
-        columns, row_count, _ = STITCHED.fullmatch(image).groups()  # type: ignore[union-attr]
-        megapixels = int(columns) * int(row_count) * 768 * 512 / 1e6
-        gain = psnr[image, best] - psnr[image, plain]
-        parts.append(f"{gain:+.2f} dB ({megapixels:.1f} megapixels, {seconds} seconds, {psnr[image, best]:.2f} dB)")
-    return ", ".join(parts)
-
-
 def page(folder: Path, rows: list[Row]) -> Page:
     """Write the report."""
-    clocked, rows = [row for row in rows if row["image"] in CLOCKS], [row for row in rows if row["image"] not in CLOCKS]
     of_gpu = rows_of_gpu({row["image"] for row in rows})
     panels = [Panel("", rows + of_gpu, "core_seconds", quantity) for quantity in QUANTITIES]
     save_lines(folder / "convergence.png", panels, "method", "budget")
@@ -106,9 +78,6 @@ def page(folder: Path, rows: list[Row]) -> Page:
         f"{means['best', start]:.2f} dB, and `{first}`, the best by then, {means[first, start]:.2f} dB."
     )
     method = METHOD
-    if clocked:
-        method += METHOD_OF_CLOCKS
-        answer += f" On large photos with `max_seconds` regions change the PSNR by {_describe_clocks(clocked)}."
     if of_gpu:
         method += METHOD_OF_GPU
         seconds, value = (fmean(values_of(of_gpu, quantity)) for quantity in ("seconds", "psnr"))
