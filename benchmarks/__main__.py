@@ -9,8 +9,8 @@ from .core.run import Options, run_experiment
 
 # modules of this package with `jobs`, `measure` and `page`
 EXPERIMENTS = (
-    "quality", "convergence", "clock", "published", "ablation", "rate", "pairs", "previews", "maps", "labels", "enlarge",
-    "fill", "video", "batch", "many", "loading", "render", "gpu", "gpu-fit", "decode",
+    "quality", "convergence", "clock", "published", "ablation", "rate", "pairs", "previews", "maps", "labels",
+    "enlarge", "fill", "video", "batch", "many", "loading", "render", "gpu", "gpu-fit", "decode",
 )  # fmt: skip
 
 
