@@ -18,7 +18,7 @@ NUM_GAUSSIANS = 1_250
 REPORT_OF_GPU = Path(__file__).parent / "reports/gpu-fit" / RESULTS_FILE
 BUDGETS = (2, 5, 15, 60)  # seconds of a core
 QUANTITIES = ("psnr", "ef_psnr")
-# photos of Kodak side by side, of 0.8, 3.1 and 12.6 megapixels; seconds of the clock, and number of Gaussians
+# `max_seconds` of fits of Kodak photos side by side, of 0.8, 3.1 and 12.6 megapixels
 CLOCKS = {"1 x 2 photos": 20, "2 x 4 photos": 20, "4 x 8 photos": 60}
 CLOCK_COUNT = 1_000
 CLOCK_METHODS = ("best", "best-baseline")
@@ -34,7 +34,7 @@ the call on a GPU."""
 
 
 def measure(image: str, method: str, n: int, data: str, quick: bool) -> list[Row]:
-    """Fit in each budget."""
+    """Fit an image once within each budget of seconds."""
     pixels, labels = load_mapped(image, data, quick)
     rows: list[Row] = []
     if image in CLOCKS:
@@ -51,7 +51,7 @@ def measure(image: str, method: str, n: int, data: str, quick: bool) -> list[Row
 
 
 def jobs(options: Options) -> list[Job]:
-    """Fit frames of DAVIS; without data, photos of scikit-image."""
+    """List fits of frames of DAVIS; without data, of photos of scikit-image."""
     images = choose(options, "davis")
     n = 40 if options.quick else NUM_GAUSSIANS
     pairs = [(image, method, n) for image in images for method in METHODS]
@@ -61,14 +61,14 @@ def jobs(options: Options) -> list[Job]:
 
 
 def rows_of_gpu(images: set[str]) -> list[Row]:
-    """Read the fits of these images on a GPU, where they were measured."""
+    """Read the fits of these images on a GPU from the report of `gpu-fit`, if it has them."""
     rows = read_rows(REPORT_OF_GPU) if REPORT_OF_GPU.is_file() else []
     rows = [row for row in rows if row["image"] in images and (row["n"], row["method"]) == (NUM_GAUSSIANS, GPU)]
     return [{**row, "budget": 0, "core_seconds": row["seconds"]} for row in rows]
 
 
 def _describe_clocks(rows: list[Row]) -> str:
-    """Say what regions gain within the time, by megapixels."""
+    """Describe what regions gain within `max_seconds`, by megapixels."""
     psnr = {(row["image"], row["method"]): row["psnr"] for row in rows}
     best, plain = CLOCK_METHODS
     parts = []
