@@ -1,1 +1,1 @@
-"""Experiments with public names of kcgs, a module for each question: `python -m benchmarks NAME -o DIR`."""
+"""Experiments on the public API of kcgs, one module per question: `python -m benchmarks NAME -o DIR`."""

@@ -11,7 +11,7 @@ from .core.images import choose
 from .core.run import Job, Options, Page, Row
 
 COUNTS = (1_250, 7_500)
-# N of more fits of `best`, between whose files those of the other rows are found
+# N of further fits of `best`; at equal bytes their files are interpolated
 CURVE = (1_000, 1_500, 6_000, 9_000)
 METHODS: dict[str, Method] = {
     "best": ("best", {}),
@@ -35,7 +35,7 @@ measure = measure_fit
 
 
 def jobs(options: Options) -> list[Job]:
-    """Fit every row, all images at the smaller N first; without data, photos of scikit-image."""
+    """List the fits of every row, the smaller N first; without data, of photos of scikit-image."""
     images = choose(options, "davis")
     counts, curve = ((40,), (50,)) if options.quick else (COUNTS, CURVE)
     listing = [job for n in counts for job in plan(images, (n,), METHODS, options)]

@@ -25,7 +25,7 @@ from .core.images import choose, load, resize
 from .core.run import Job, Options, Page, Row
 
 KODAK = "Kodak"
-# Gaussians, by which factor photos are reduced, and the sizes of batches on a core and on a GPU, of crops of a side
+# by size of crop: N, the factor by which photos are reduced, the batch sizes on one core, the batch sizes on a GPU
 CASES: dict[str, tuple[int, int, tuple[int, ...], tuple[int, ...]]] = {
     "32 x 32": (64, 4, (1, 16, 128, 1024), (1, 64, 512, 4096)),
     "64 x 64": (128, 4, (1, 16, 64, 256), (1, 64, 512, 2048)),
@@ -35,13 +35,14 @@ CASES: dict[str, tuple[int, int, tuple[int, ...], tuple[int, ...]]] = {
 }
 QUICK_BATCHES = (1, 4)
 CORE, GPU = "one core", "GPU"
-# images that are fitted one by one, of which the mean is taken
+# number of images that are fitted one by one; their mean time is reported
 NUM_SINGLES = 8
 ROUNDS = 3
-# times as fast as one by one on a core, and images per second on an H100 or H200
+# factor against fits one by one, on one core
 GOALS_OF_A_CORE = {"32 x 32": 6.0, "64 x 64": 3.0, "128 x 128": 1.2}
+# images per second on an H100 or H200
 GOALS_OF_A_GPU = {"32 x 32": 4000.0, "64 x 64": 1200.0, "128 x 128": 300.0, "256 x 256": 60.0, KODAK: 4.0}
-# dB by which the PSNR of a batch may differ from that of its images alone
+# largest difference of PSNR between an image in a batch and the image alone, in dB
 MOST_DIFFERENCE = 0.02
 METHOD = f"""Crops of photos of Kodak that are reduced by area: to a quarter of their sides for crops of 32 and 64
 pixels, to half for 128; and the 24 photos as they are, upright ones turned. `fit(images, None, N)` with its default
@@ -53,7 +54,7 @@ adds at the peak."""
 
 @cache
 def crops(case: str, count: int, data: str, quick: bool) -> Tensor:
-    """Cut so many crops of a case from reduced photos, (B, 3, S, S); the same photo gives several."""
+    """Cut `count` crops of a case from reduced photos, (B, 3, S, S); one photo may give several crops."""
     names = choose(Options(Path(), Path(data) if data else None, quick), "kodak")
     if case == KODAK:
         photos = [load(name, data, quick).image for name in names]
@@ -71,7 +72,7 @@ def crops(case: str, count: int, data: str, quick: bool) -> Tensor:
 
 @cache
 def reduced(name: str, data: str, quick: bool, reduction: int, side: int) -> Tensor:
-    """Reduce a photo by area, but to no less than a side."""
+    """Reduce a photo by area; each side keeps at least `side` pixels."""
     photo = load(name, data, quick).image
     height, width = (max(side, length // reduction) for length in photo.shape[1:])
     return resize(photo, (height, width), "box")
@@ -86,12 +87,12 @@ def fit_all(images: Tensor, n: int, config: FitConfig, together: bool) -> Tensor
 
 
 def fit_by_name(case: str, batch: int, data: str, quick: bool, config: FitConfig) -> None:
-    """Fit a batch, for a clock of memory."""
+    """Fit a batch in a process whose memory is measured."""
     fit_all(crops(case, batch, data, quick), CASES[case][0], config, together=True)
 
 
 def measure(image: str, method: str, batches: list[int], data: str, quick: bool) -> list[Row]:
-    """Time batches of a case, in turns, and compare PSNR with that of images one by one."""
+    """Time the batches of a case in turns, and compare their PSNR with fits one by one."""
     n, device = (20 if quick else CASES[image][0]), "cuda" if method == GPU else "cpu"
     config = FitConfig(iterations=QUICK_ITERATIONS if quick else None)
     singles = min(NUM_SINGLES, max(batches))
@@ -100,7 +101,7 @@ def measure(image: str, method: str, batches: list[int], data: str, quick: bool)
     psnrs: dict[int, Tensor] = {}
     with threads(1 if method == CORE else os.cpu_count() or 1):
         precompile(config, device)
-        for _ in range(1 if quick or image == KODAK else ROUNDS + 1):  # the first compiles
+        for _ in range(1 if quick or image == KODAK else ROUNDS + 1):  # the first round compiles
             for batch in batches:
                 start = time.perf_counter()
                 psnrs[batch] = fit_all(images[batch], n, config, together=batch > 1)
@@ -127,7 +128,7 @@ def measure(image: str, method: str, batches: list[int], data: str, quick: bool)
 
 
 def jobs(options: Options) -> list[Job]:
-    """Time all cases on one core, and on a GPU where there is one."""
+    """List all cases on one core, and on a GPU if there is one."""
     devices = [CORE, *([GPU] if torch.cuda.is_available() else [])]
     cases = [name for name in CASES if not options.quick or name == "32 x 32"]
     if options.data is None:

@@ -39,7 +39,7 @@ def measure(image: str, method: str, data: str, quick: bool) -> list[Row]:
     render = result.scene.render()
     return [
         {
-            "image": image, "method": method, "megapixels": round(pixels[0].numel() / 1e6, 1), "budget": budget,
+            "image": image, "method": method, "megapixels": float(f"{pixels[0].numel() / 1e6:.3g}"), "budget": budget,
             "seconds": seconds, "iterations": result.history[-1].iteration, "psnr": float(psnr(render, pixels)),
             "ef_psnr": float(ef_psnr(render, pixels, labels)),
         }

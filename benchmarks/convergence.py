@@ -28,7 +28,7 @@ the call on a GPU."""
 
 
 def measure(image: str, method: str, n: int, data: str, quick: bool) -> list[Row]:
-    """Fit in each budget."""
+    """Fit an image once within each budget of seconds."""
     pixels, labels = load_mapped(image, data, quick)
     rows = []
     for budget in BUDGETS:
@@ -42,14 +42,14 @@ def measure(image: str, method: str, n: int, data: str, quick: bool) -> list[Row
 
 
 def jobs(options: Options) -> list[Job]:
-    """Fit frames of DAVIS; without data, photos of scikit-image."""
+    """List fits of frames of DAVIS; without data, of photos of scikit-image."""
     images = choose(options, "davis")
     n = 40 if options.quick else NUM_GAUSSIANS
     return [{"image": i, "method": m, "n": n, **options.image_arguments()} for i in images for m in METHODS]
 
 
 def rows_of_gpu(images: set[str]) -> list[Row]:
-    """Read the fits of these images on a GPU, where they were measured."""
+    """Read the fits of these images on a GPU from the report of `gpu-fit`, if it has them."""
     rows = read_rows(REPORT_OF_GPU) if REPORT_OF_GPU.is_file() else []
     rows = [row for row in rows if row["image"] in images and (row["n"], row["method"]) == (NUM_GAUSSIANS, GPU)]
     return [{**row, "budget": 0, "core_seconds": row["seconds"]} for row in rows]

@@ -25,12 +25,12 @@ from .core.scenes import FITTED, SIZES, scene_of, size_of
 
 CUTOFFS = (1e-2, 1 / 255, 1e-3, 1e-4, 1e-6)
 DEFAULT_CUTOFF = 1e-4
-# of the truth, in float64: what it leaves out of a sum is far below float32's rounding
+# cutoff of the exact render in float64: the weights below it are far below the rounding of float32
 TRUTH_CUTOFF = 1e-12
 ROUNDS = 5
 SIZE_TITLES = {"native": "a scene's own size", "3840 wide": "3,840 pixels wide"}
 DECODERS = ("onnxruntime", "torch, cpu", "torch, tiled")
-# the others take seconds for a wide image
+# decoders that are timed on a wide image; the others take seconds
 FAST = ("onnxruntime", "torch, cpu")
 METHOD = """Milliseconds for one image, medians, all decoders of a scene in turns. `onnxruntime` runs the scene's
 own decoder (`kcgs.onnx.scene_decoder`), `torch` is `RegionSplatRenderer` with a backend. Loading goes from the file
@@ -40,13 +40,13 @@ about one size, without contours, with hard and with soft ones; the others are f
 
 
 def open_decoder(decoder: str, path: str, cutoff: float, size: tuple[int, int], count: int) -> Callable[[], Tensor]:
-    """Read a file and return what renders (C, H, W) at that size."""
+    """Open a decoder's file and return a function that renders (C, H, W) at this size."""
     if decoder == "onnxruntime":
         import onnxruntime
 
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = count
-        # idle threads would go on spinning while the next decoder is timed
+        # otherwise idle threads keep spinning while the next decoder is timed
         options.add_session_config_entry("session.force_spinning_stop", "1")
         session = onnxruntime.InferenceSession(f"{path}-{cutoff:g}.onnx", options, providers=["CPUExecutionProvider"])
         feeds: dict[str, Any] = {"size": np.array(size, np.int64)}
@@ -68,7 +68,7 @@ def write_files(scene: Scene, path: str, cutoffs: tuple[float, ...]) -> None:
 
 
 def measure(image: str, size: str, count: int, cutoffs: list[float], rounds: int) -> list[Row]:
-    """Race the decoders of a scene on so many threads."""
+    """Time the decoders of a scene in turns, on `count` threads."""
     scene, names, rows = scene_of(image), DECODERS if size == "native" else FAST, []
     target = size_of(scene, size)
     with TemporaryDirectory() as folder, threads(count):
@@ -96,7 +96,7 @@ def measure(image: str, size: str, count: int, cutoffs: list[float], rounds: int
 
 
 def jobs(options: Options) -> list[Job]:
-    """Race the decoders of workloads and fitted scenes."""
+    """List the timings of decoders, for workloads and fitted scenes."""
     scenes = [f"{name} {contours}" for name in ("W1", "W2") for contours in ("none", "hard", "soft")]
     scenes = ["W3 hard"] if options.quick else [*scenes, *(f"{name} soft" for name in FITTED)]
     return [
@@ -119,7 +119,7 @@ def page(folder: Path, rows: list[Row]) -> Page:
     save_lines(folder / "decode.png", panels, "method", "cutoff")
     columns = ("ms", "error", "load_ms", "bytes", "peak_MB")
     one_thread = [row for row in default if row["threads"] == 1]
-    # hard contours and none differ little from soft ones
+    # times with hard contours or without contours differ little from times with soft contours
     shown = [row for row in one_thread if row["image"].endswith("soft")] or one_thread
     table = means_table(shown, ["image", "size", "method"], "", columns)
     times = {(r["image"], r["size"], r["method"]): r["ms"] for r in one_thread}

@@ -23,7 +23,7 @@ FACTORS = (2, 4)
 # pixels of the small photo per Gaussian
 SHARES = (330, 80, 25)
 ROUNDS = 3
-BAND = 5  # pixels of the small photo
+BAND = 5  # width of the edge band, in pixels of the small photo
 QUANTITIES = ("psnr", "ef_psnr")
 SCENE = "scene"
 COMPARISONS = (Comparison(SCENE, "own render, bicubic"), Comparison(SCENE, "own render, Lanczos"))
@@ -35,7 +35,7 @@ those of the given map on DAVIS, and on Kodak those found in the original."""
 
 
 def measure(image: str, group: str, factor: int, share: int, data: str, quick: bool) -> list[Row]:
-    """Fit a small photo, and measure what is shown at the original size."""
+    """Fit a small photo, and measure each enlargement at the original size."""
     pixels, labels = load_mapped(image, data, quick)
     height, width = (side // factor * factor for side in labels.shape)
     pixels, labels = pixels[:, :height, :width].contiguous(), labels[:height, :width].contiguous()
@@ -65,7 +65,7 @@ def enlarge(image: Callable[[], Tensor], size: tuple[int, int], resampling: str)
 
 
 def jobs(options: Options) -> list[Job]:
-    """Fit photos of DAVIS and Kodak at half and a quarter of their size."""
+    """List fits of photos of DAVIS and Kodak at half and a quarter of their size."""
     images = [("DAVIS", "disc")]
     if not options.quick:
         images = [(group, name) for group in ("DAVIS", "Kodak") for name in names(options.folder(), group.lower())]

@@ -26,11 +26,11 @@ from .core.run import Job, Options, Page, Row
 NUM_GAUSSIANS = 3_000
 QUICK_GAUSSIANS = 60
 FILLS = {"not filled": False, "filled": True}
-# of the ring around the uncovered pixels that they are compared with, in pixels
+# width of the ring around the edit whose gradients are the standard for a steep pixel, in pixels
 RING = 40
-# around a moved object, which is not measured, in pixels
+# width of the margin around a moved object that is not measured, in pixels
 CONTOUR = 2
-# around the edit in the figure, in pixels
+# width of the surroundings of an edit in the figure, in pixels
 FIGURE_MARGIN = 45
 QUANTITIES = ("steep", "beyond [0, 1]")
 COMPARISON = Comparison("filled", "not filled")
@@ -42,7 +42,7 @@ grass, water and roads pass; those of crowds and of rails are sharp, and repeat 
 
 
 def measure(image: str, edit: str, n: int, folder: str, data: str, quick: bool) -> list[Row]:
-    """Edit a scene with each fill; their images are written beside each other."""
+    """Edit a scene with and without filling, and write both renders beside the scene."""
     pixels, labels = load(image, data, quick)
     assert labels is not None
     settings: dict[str, Any] = {"iterations": QUICK_ITERATIONS, "merge_regions": False} if quick else {}
@@ -80,12 +80,12 @@ def measure(image: str, edit: str, n: int, folder: str, data: str, quick: bool) 
 
 
 def dilate(mask: Tensor, pixels: int) -> Tensor:
-    """Return what is within so many pixels of a mask."""
+    """Return the pixels at most `pixels` away from a mask."""
     return torch.from_numpy(distance_transform_edt(~mask.numpy()) <= pixels)
 
 
 def jobs(options: Options) -> list[Job]:
-    """Edit frames of DAVIS."""
+    """List the edits of frames of DAVIS."""
     images = ["disc"] if options.quick else list(options.only) or names(options.folder(), "davis")
     n = QUICK_GAUSSIANS if options.quick else NUM_GAUSSIANS
     arguments = {"n": n, "folder": str(options.output / "runs"), **options.image_arguments()}
@@ -93,7 +93,7 @@ def jobs(options: Options) -> list[Job]:
 
 
 def page(folder: Path, rows: list[Row]) -> Page:
-    """Write the report; without the images of the run the figure stays."""
+    """Write the report; if the images of the run are gone, keep the old figure."""
     paths = {folder / "runs" / f"{row['image']}-{row['edit']}.png": 0 for row in rows}
     sheet = [[load_image(path)] for path in paths if path.is_file()]
     if sheet:

@@ -22,9 +22,9 @@ from .core.run import Job, Options, Page, Row
 from .core.scenes import BATCH, BATCHES, FITTED, fits_in, scene_of
 from .render import ANISOTROPIES, CUTOFFS, DEFAULT_CUTOFF, differentiate, differentiate_exactly, errors, needles, render
 
-# kernel and device
+# device of each kernel
 METHODS = {"cuda": "cuda", "tiled": "cuda", "cpu": "cpu"}
-# of scenes that slower kernels render, too
+# slower kernels that also render a scene
 COMPARED = {
     "W3": ("tiled", "cpu"),
     "W1": ("tiled", "cpu"),
@@ -35,11 +35,12 @@ COMPARED = {
 # standard deviations in pixels, of Gaussians three times as long as wide
 GIANTS = (1e2, 1e4)
 ROUNDS = 20
-# in a row, without a pause between them
+# calls per timing, without a pause between them
 CALLS = 10
 SLOW_ROUNDS = 5
-# at most, on an H100 or H200
+# scenes of 480 x 854 pixels
 SCENES_480P = ("W1", "W2", "dog-1250", "dog-7500")
+# largest times on an H100 or H200, in milliseconds
 _GOALS_480P = {"forward_ms": 0.50, "both_ms": 0.75, "captured_forward_ms": 0.12, "captured_both_ms": 0.22}
 GOALS = {
     **dict.fromkeys(SCENES_480P, _GOALS_480P),
@@ -65,7 +66,7 @@ gradients, relative to the largest of their tensor."""
 
 
 def make_scene(image: str, data: str) -> Scene:
-    """Make "needles ANISOTROPY" or "giants SIGMA", or what `scene_of` knows."""
+    """Make the scene "needles ANISOTROPY", "giants SIGMA", or a scene of `scene_of`."""
     kind, _, number = image.partition(" ")
     if kind == "needles":
         return needles(float(number))
@@ -73,13 +74,13 @@ def make_scene(image: str, data: str) -> Scene:
 
 
 def measure_errors(scene: Scene, method: str, cutoffs: list[float]) -> list[Row]:
-    """Compare with the reference at each cutoff."""
+    """Compare a kernel with the reference at each cutoff."""
     truth = differentiate_exactly(scene)
     return [{"cutoff": cutoff, **errors(truth, scene, method, cutoff)} for cutoff in cutoffs]
 
 
 def measure_times(scene: Scene, method: str, rounds: int, calls: int) -> list[Row]:
-    """Time eager calls, and take the memory that one adds."""
+    """Time eager calls, and measure the memory that one call adds."""
     forward = partial(torch.no_grad()(render), scene, method, DEFAULT_CUTOFF)
     both = partial(differentiate, scene, method, DEFAULT_CUTOFF)
     with threads(os.cpu_count() or 1):
@@ -88,7 +89,7 @@ def measure_times(scene: Scene, method: str, rounds: int, calls: int) -> list[Ro
 
 
 def measure_captured(scene: Scene, method: str, rounds: int, calls: int) -> list[Row]:
-    """Time replays, and compare what the last one left with an eager call."""
+    """Time replays of CUDA graphs, and compare the result of the last replay with an eager call."""
     both = partial(differentiate, scene, method, DEFAULT_CUTOFF)
     forward_graph, _ = capture(partial(torch.no_grad()(render), scene, method, DEFAULT_CUTOFF))
     both_graph, (image, gradients) = capture(both)
@@ -101,7 +102,7 @@ def measure_captured(scene: Scene, method: str, rounds: int, calls: int) -> list
 
 
 def measure_kernels(scene: Scene, method: str, calls: int) -> list[Row]:
-    """Count the kernels of an image and its gradients."""
+    """Count the GPU kernels that one image and its gradients launch."""
     return [count_kernels(partial(differentiate, scene, method, DEFAULT_CUTOFF), calls)]
 
 
@@ -111,7 +112,7 @@ TASKS: dict[str, Callable[..., list[Row]]] = {
 
 
 def measure(image: str, method: str, device: str, task: str, settings: dict[str, Any], data: str) -> list[Row]:
-    """Do one of TASKS with one kernel."""
+    """Run one of TASKS on a scene with one kernel."""
     check_device(device)
     scene = make_scene(image, data).to(device)
     row = {"image": image, "method": method, "n": scene.field.means.numel() // 2, "cutoff": DEFAULT_CUTOFF}
@@ -119,7 +120,7 @@ def measure(image: str, method: str, device: str, task: str, settings: dict[str,
 
 
 def jobs(options: Options) -> list[Job]:
-    """List errors, then times, then what might disturb times: captures, and counts by the profiler."""
+    """List errors, then times; captures and the profiler's counts come last, since they may disturb times."""
     fits = [] if options.quick else [f"{name} soft" for name in fits_in(options.data)]
     timed = ["W3"] if options.quick else ["W3", "W1", "W1 soft", "W2", *fits, "W4", f"{BATCH} none", BATCH]
     batches = [] if options.quick else BATCHES
@@ -212,7 +213,7 @@ def _scene_name(row: Row) -> str:
 
 
 def _milliseconds(actions: Mapping[str, Callable[[], object]], rounds: int, calls: int) -> Row:
-    """Time a call of each, of so many in a row."""
+    """Return the milliseconds of one call of each action, from timings of `calls` calls in a row."""
     times = milliseconds({name: partial(finish, action, calls) for name, action in actions.items()}, rounds)
     return {name: time / calls for name, time in times.items()}
 

@@ -30,7 +30,7 @@ from .core.run import Job, Options, Page, Row
 
 GPU, CORES, OTHER = "best, GPU", "best, cores", "gaussian-image, GPU"
 FIRST = {"process": "best, GPU, new process", "machine": "best, GPU, new machine"}
-# recipe, settings that differ from it, device
+# recipe, settings that differ from the recipe, device
 METHODS: dict[str, tuple[str, dict[str, Any], str]] = {
     GPU: ("best", {}, "cuda"),
     CORES: ("best", {}, "cpu"),
@@ -39,13 +39,14 @@ METHODS: dict[str, tuple[str, dict[str, Any], str]] = {
 }
 KODAK_COUNT = 10_000
 DAVIS_COUNTS = (500, 1_250, 5_000, 7_500, 10_000)
-# of the fits that others are compared with
+# images and N at which the other methods are compared with `best` on a GPU
 KODAK_COMPARED = ("kodim05", "kodim15", "kodim23")
 DAVIS_COMPARED = [("dog", 1_250), ("dog", 7_500)]
-# before a clock starts: strategies act at fractions of a fit, so that a short one compiles what a long one needs
+# iterations of the fit that compiles all programs: events act at fractions of a fit, so that a short fit is enough
 WARM_UP_ITERATIONS = 60
-# on an H100 or H200: seconds and dB, and seconds that a first fit may take longer
+# on an H100 or H200: largest seconds of a fit, least PSNR in dB
 GOALS = {"Kodak": {"seconds": 0.5, "psnr": 36.5}, "DAVIS": {"seconds": 1.5}}
+# seconds that the first fit of a process may take longer than the next
 GOAL_OF_A_FIRST_FIT = 15.0
 CACHES = ("NUMBA_CACHE_DIR", "TRITON_CACHE_DIR")
 COMPARISONS = (Comparison(GPU, CORES), Comparison(GPU, OTHER))
@@ -58,7 +59,7 @@ compiled code; *next* is the second fit of that process, and *process seconds* b
 
 
 def set_of(image: str) -> str:
-    """Name the set of an image."""
+    """Return the name of an image's set."""
     return "Kodak" if image.startswith("kodim") else "DAVIS" if image in FRAMES else "others"
 
 
@@ -78,7 +79,7 @@ def warm_up(config: FitConfig, n: int, size: tuple[int, int], has_labels: bool, 
 
 
 def timed_fit(image: Tensor, labels: Tensor | None, n: int, config: FitConfig) -> tuple[FitResult, float]:
-    """Fit, and return the seconds, too."""
+    """Fit an image, and return the result and the seconds."""
     synchronize()
     start = time.perf_counter()
     result = fit(image, labels, n, recipe=config)
@@ -93,13 +94,13 @@ def load_to(device: str, image: str, data: str, quick: bool) -> tuple[Tensor, Te
 
 
 def fit_in_process(image: str, n: int, method: str, device: str, data: str, quick: bool) -> float:
-    """Fit, and return the seconds alone, which another process can read."""
+    """Fit an image, and return only the seconds, which another process can receive."""
     return timed_fit(*load_to(device, image, data, quick), n, config_of(method, quick))[1]
 
 
 @contextmanager
 def caches_in(folder: str) -> Iterator[None]:
-    """Let processes that are started keep compiled code in a folder."""
+    """Let new processes keep their compiled code in a folder."""
     before = {name: os.environ.pop(name, None) for name in CACHES}
     os.environ.update(dict.fromkeys(CACHES, folder))
     try:
@@ -112,7 +113,7 @@ def caches_in(folder: str) -> Iterator[None]:
 
 
 def measure_first_fit(*arguments: Any, new_machine: bool) -> Row:
-    """Fit twice in a process of its own."""
+    """Fit twice in a new process."""
     with TemporaryDirectory() as folder, caches_in(folder) if new_machine else nullcontext():
         start = time.perf_counter()
         with get_context("spawn").Pool(1) as pool:
@@ -139,7 +140,7 @@ def measure(image: str, n: int, method: str, device: str, data: str, quick: bool
 
 
 def jobs(options: Options) -> list[Job]:
-    """Fit photos of Kodak and frames of DAVIS; without data, photos of scikit-image."""
+    """List fits of photos of Kodak and frames of DAVIS; without data, of photos of scikit-image."""
     plan = [(image, KODAK_COUNT, GPU) for image in choose(options, "kodak")]
     if options.quick:
         plan = [("disc", 30, method) for method in (GPU, CORES, OTHER, FIRST["process"])]

@@ -24,7 +24,7 @@ from .core.figures import Panel, save_lines
 from .core.images import load
 from .core.run import Job, Options, Page, Row
 
-# where maps are in the data; none of Kodak, on whose maps the tables of kcgs were trained
+# paths of the maps in the data; none of Kodak, because the tables of kcgs were trained on maps of Kodak
 SETS = {
     "DAVIS 2016": "DAVIS/Annotations/480p/*/00000.png",
     "BSDS500": "bsds/*/mask.png",
@@ -40,7 +40,7 @@ second."""
 
 
 class Codec(NamedTuple):
-    """The package that a codec needs, and how (H, W) of regions' numbers becomes bytes, and back."""
+    """A codec's package, and its functions from region numbers (H, W) to bytes and back."""
 
     package: str
     encode: Callable[[Any], Any]
@@ -74,7 +74,7 @@ def _read(data: bytes) -> Any:
 
 
 def _jxl(index: Any) -> bytes:
-    plugin: Any = import_module("pillow_jxl.JpegXLImagePlugin")  # adds the format to Pillow
+    plugin: Any = import_module("pillow_jxl.JpegXLImagePlugin")  # the import adds the format to Pillow
     plugin.DECODE_THREADS = 1
     return _write("JXL", index, lossless=True, effort=9, num_threads=1)
 
@@ -106,7 +106,7 @@ def region_numbers(labels: Any) -> Any:
 
 
 def measure(image: str, group: str, data: str, quick: bool) -> list[Row]:
-    """Code a map in all codecs that are there; a RuntimeError: one loses labels."""
+    """Code a map with all installed codecs; raise a RuntimeError if a codec changes a label."""
     labels = (load_labels(Path(data, image)) if data else segment(load(image, quick=quick).image)).numpy()
     index, rows = region_numbers(labels), []
     for name, codec in CODECS.items():
@@ -129,7 +129,7 @@ def measure(image: str, group: str, data: str, quick: bool) -> list[Row]:
 
 
 def jobs(options: Options) -> list[Job]:
-    """Code the maps of all sets; without data, one that is found in a photo."""
+    """List the maps of all sets; without data, the map that `segment` finds in a photo."""
     images = [("scikit-image, found", "astronaut")]
     if options.data is not None:
         images = [

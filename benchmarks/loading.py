@@ -26,14 +26,14 @@ from .core.goals import Goal, goals_table, missed_goals
 from .core.run import Job, Options, Page, Row
 
 SHARDS, PNG, JPEG = "shards of Gaussians", "PNG", "JPEG"
-# sides of images, and the Gaussians of a scene
+# number of Gaussians of a scene, by the size of its image
 SIDES = {"32 x 32": 64, "128 x 128": 256}
 NUM_IMAGES = 4096
 QUICK_IMAGES = 64
 BATCH = 64
 ROUNDS = 5
 QUALITY = 90
-# times as fast as JPEG
+# factor against decoding JPEG
 GOAL = 5.0
 METHOD = f"""A shuffled DataLoader in this process, in batches of {BATCH}: medians of {ROUNDS} passes over
 {NUM_IMAGES:,} images, all ways in turns, on one thread, with files in the page cache. Scenes are dense tensors from two
@@ -43,7 +43,7 @@ image."""
 
 
 class Files(Dataset[Tensor]):
-    """Images in files that are in memory."""
+    """A data set of encoded images in memory."""
 
     def __init__(self, images: Tensor, suffix: str) -> None:
         self.files: list[bytes] = []
@@ -74,7 +74,7 @@ def write_shards(folder: Path, count: int, side: int, num_gaussians: int) -> Non
 
 
 def seconds_of(dataset: Any, with_tokens: bool) -> float:
-    """Time a shuffled pass."""
+    """Return the seconds of one shuffled pass over a data set."""
     collate, generator = getattr(dataset, "collate", None), torch.Generator().manual_seed(0)
     loader = DataLoader(dataset, BATCH, shuffle=True, collate_fn=collate, generator=generator)
     start = time.perf_counter()
@@ -85,7 +85,7 @@ def seconds_of(dataset: Any, with_tokens: bool) -> float:
 
 
 def measure(image: str, data: str, quick: bool) -> list[Row]:
-    """Time all ways, in turns."""
+    """Time scenes and image files in turns."""
     side, num_gaussians = int(image.split()[0]), SIDES[image]
     count = QUICK_IMAGES if quick else NUM_IMAGES
     images = crops(image, count, data, quick)
@@ -110,7 +110,7 @@ def measure(image: str, data: str, quick: bool) -> list[Row]:
 
 
 def jobs(options: Options) -> list[Job]:
-    """Time small and larger images."""
+    """List the sizes of images to time."""
     return [{"image": side, **options.image_arguments()} for side in SIDES if not options.quick or side == "32 x 32"]
 
 

@@ -23,14 +23,14 @@ from .core.run import Job, Options, Page, Row
 
 COUNTS = (10_000, 30_000, 50_000, 70_000)
 QUICK_COUNTS = (100, 200)
-# images of four photos of Kodak
+# images made of four photos of Kodak each
 LARGE = tuple(f"2 x 2 photos {k + 1}" for k in range(8))
 # all photos of Kodak in one image
 HUGE, HUGE_COUNT = "4 x 6 photos", 300_000
 CPU, GPU = "CPU", "GPU"
-# of Kodak on a GPU: N, dB and seconds
+# for Kodak on a GPU: N, least PSNR in dB, largest seconds
 GOAL = (50_000, 48.5, 2.0)
-# name, N, dB and seconds on Kodak as printed, on GPUs
+# published results on Kodak with a GPU: method, N, PSNR in dB, seconds
 PRINTED: tuple[tuple[str, int, float, float | None], ...] = (
     ("GaussianImage++", 10_000, 35.41, None),
     ("Structure-Guided", 30_000, 40.51, 132.0),
@@ -50,7 +50,7 @@ peak. As printed, on GPUs: {
 
 
 def measure(image: str, method: str, counts: list[int], data: str, quick: bool) -> list[Row]:
-    """Fit an image with ever more Gaussians."""
+    """Fit an image several times, each time with more Gaussians."""
     device = "cuda" if method == GPU else "cpu"
     config = FitConfig(iterations=QUICK_ITERATIONS if quick else None)
     pixels, rows = load(image, data, quick).image.to(device), []
@@ -77,17 +77,17 @@ def measure(image: str, method: str, counts: list[int], data: str, quick: bool) 
 
 
 def fit_by_name(image: str, data: str, quick: bool, method: str, config: FitConfig, n: int) -> None:
-    """Fit an image, for a clock of memory."""
+    """Fit an image in a process whose memory is measured."""
     fit(load(image, data, quick).image.to("cuda" if method == GPU else "cpu"), None, n, recipe=config)
 
 
 def set_of(image: str) -> str:
-    """Return which of the three sets of images has an image."""
+    """Return the name of an image's set, one of three."""
     return HUGE if image == HUGE else "2 x 2 photos" if image in LARGE else "Kodak"
 
 
 def jobs(options: Options) -> list[Job]:
-    """Fit all images on a CPU, and on a GPU where there is one."""
+    """List fits of all images on a CPU, and on a GPU if there is one."""
     devices = [CPU, *([GPU] if torch.cuda.is_available() else [])]
     images = choose(options, "kodak")
     counts: dict[str, tuple[int, ...]] = {image: QUICK_COUNTS if options.quick else COUNTS for image in images}

@@ -14,7 +14,7 @@ from .core.images import PHOTOS, load, names
 from .core.run import Job, Options, Page, Row
 
 COUNTS = (200, 400, 1_000)
-# of more fits without a map, between whose files those with a map are found
+# N of further fits without a map; at equal bytes their files are interpolated
 BASELINE_COUNTS = (300, 650, 1_600)
 MAP, NO_MAP = "map", "no map"
 SAME_N, EQUAL_BITS = Comparison(MAP, NO_MAP), Comparison(MAP, f"{NO_MAP}, equal bits")
@@ -27,7 +27,7 @@ Table: PSNR / EF-PSNR in dB; at the same bytes of decoded files."""
 
 
 def measure(image: str, n: int, methods: list[str], data: str, quick: bool) -> list[Row]:
-    """Fit with the map and without."""
+    """Fit an image with and without the map of `segment`."""
     pixels, length = load(image, data, quick).image, {"iterations": QUICK_ITERATIONS} if quick else {}
     start = time.process_time()
     labels = segment(pixels)
@@ -41,7 +41,7 @@ def measure(image: str, n: int, methods: list[str], data: str, quick: bool) -> l
 
 
 def jobs(options: Options) -> list[Job]:
-    """Fit photos of BSDS; without data, of scikit-image."""
+    """List fits of photos of BSDS; without data, of scikit-image."""
     images = ["astronaut"] if options.quick else [*PHOTOS] if options.data is None else names(options.data, "bsds")
     arguments = options.image_arguments()
     counts, more = ((60,), (120,)) if options.quick else (COUNTS, BASELINE_COUNTS)

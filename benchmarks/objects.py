@@ -27,10 +27,11 @@ from kcgs.segment import segment_with_scores
 from .core.compare import markdown
 
 NUM_CLICKS = 4
-# by which a box is larger than the mask, on each side
+# share of the mask's sides by which a box is larger on each side
 MARGIN = 0.05
-# overlap with the mask of a good result, and of a failure
+# least overlap (IoU) with the mask of a good result
 GOOD = 0.9
+# overlap below which a result is a failure
 BAD = 0.5
 
 Mask = NDArray[np.bool_]
@@ -49,7 +50,7 @@ def box_of(mask: Mask) -> list[int]:
 
 
 def next_click(mask: Mask, truth: Mask) -> tuple[str, list[int]] | None:
-    """Return foreground or background, and (x, y) of a click; None where all is right."""
+    """Return "foreground" or "background" and the (x, y) of the next click; None if no pixel is wrong."""
     areas = []
     for name, wrong in (("foreground", truth & ~mask), ("background", mask & ~truth)):
         pieces = label(wrong)[0]
@@ -66,7 +67,7 @@ def next_click(mask: Mask, truth: Mask) -> tuple[str, list[int]] | None:
 
 @dataclass
 class Way:
-    """A method with its options, and what it gave for each frame and number of clicks."""
+    """A method with its options, and its overlaps and seconds for each frame and number of clicks."""
 
     method: str
     has_box: bool
@@ -78,7 +79,7 @@ class Way:
         return f"{self.method}, box" if self.has_box else self.method
 
     def cut_out(self, image: Tensor, truth: Mask) -> None:
-        """Cut out the object of a frame with ever more clicks."""
+        """Cut out the object of a frame with 0, 1, 2 ... clicks."""
         clicks: dict[str, list[list[int]]] = {"foreground": [], "background": []}
         prompt = {"box": box_of(truth)} if self.has_box else {}
         self.overlaps.append([])

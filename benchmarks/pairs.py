@@ -34,13 +34,13 @@ FACTOR = 4
 # pixels of the small photo per Gaussian
 SHARE = 80
 OURS = "kcgs"
-# pairs per swapped repeat, and per sheet with the same image twice
+# for so many pairs there is one sheet with A and B swapped, and one sheet with the same image twice
 PAIRS_PER_CHECK = 12
 MIN_CHECKS = 2
-# of sheets, in pixels
+# pixels of a sheet
 CAPTION_HEIGHT = 36
 GAP = 8
-# "07 B clearly: streaks", "| 7 | slightly A |", "07: none"
+# examples: "07 B clearly: streaks", "| 7 | slightly A |", "07: none"
 ANSWER = re.compile(
     r"\W*(?:sheet\W*)?(?P<sheet>\d+)\W+(?P<before>(?:clear|slight)\w*\W+)?(?:prefer\w*\W+)?"
     r"(?P<choice>A|B|none|no(?:\W+difference)?|neither|same|equal)\b(?P<after>\W+(?:clear|slight)\w*)?(?P<comment>.*)",
@@ -63,7 +63,7 @@ as ordinary people would; nobody has asked people yet. Each one's answers, a lin
 
 
 def measure(image: str, comparison: str, folder: str, data: str, quick: bool) -> list[Row]:
-    """Make both images of a pair; they are written beside the photo."""
+    """Make both images of a pair, and write them beside the photo."""
     photo, iterations = load(image, data, quick).image, QUICK_ITERATIONS if quick else None
     row: Row = {"image": image, "comparison": comparison}
     if comparison == ENLARGEMENT:
@@ -94,7 +94,7 @@ def _path(folder: str | Path, row: Row) -> Path:
 
 
 def jobs(options: Options) -> list[Job]:
-    """Compare files and enlargements, of even numbers of Kodak unless others are named."""
+    """List pairs of files and of enlargements, of the even numbers of Kodak unless `only` names others."""
     comparisons = [name for name in (*BYTES, ENLARGEMENT) if name in options.only]
     images = ["disc"]
     if not options.quick:
@@ -109,7 +109,7 @@ def jobs(options: Options) -> list[Job]:
 
 
 def make_sheets(folder: Path, rows: list[Row]) -> None:
-    """Write numbered sheets, their key, and its hash."""
+    """Write numbered sheets, the key to them, and the key's hash."""
     seed = secrets.randbits(64)
     random = Random(seed)
     pairs = [random.sample(pair, 2) for pair in group_by(rows, ["comparison", "image"]).values()]
@@ -145,7 +145,7 @@ def _save_sheet(path: Path, images: list[Image.Image]) -> None:
 
 
 def read_answers(folder: Path, entries: list[Row]) -> Iterator[Row]:
-    """Yield each viewer's answer to each sheet; where a viewer answers twice, the first."""
+    """Yield each viewer's answer to each sheet; if a viewer answers twice, the first answer counts."""
     for path in sorted(folder.glob("*.txt")):
         matches = filter(None, map(ANSWER.match, path.read_text(encoding="utf-8").splitlines()))
         answers = {int(match["sheet"]): match for match in [*matches][::-1]}
@@ -214,7 +214,7 @@ def _sign(answer: Row) -> int:
 
 
 def _loss(folder: Path, answers: list[Row]) -> list[str]:
-    """Describe a pair that is lost; its sheet is written at half its size, unless the sheets are gone."""
+    """Describe a lost pair, and write its sheet at half its size, unless the sheets are gone."""
     path = f"losses/{answers[0]['sheet']:02}.jpg"
     sheet_path = folder / "sheets" / f"{answers[0]['sheet']:02}.png"
     if sheet_path.exists():

@@ -28,18 +28,18 @@ from .core.run import Job, Options, Page, Row
 
 BYTES = (200, 400, 1_000)
 FIGURE_BYTES = 1_000
-SIDE = 512  # of photos, the longer one
+SIDE = 512  # longer side of a photo, in pixels
 OURS, HASH = "kcgs", "ThumbHash"
 OTHERS = ("WebP", "AVIF")
-HASH_SIDE = 100  # the longest side that it takes
+HASH_SIDE = 100  # longest side that ThumbHash takes, in pixels
 REDUCTIONS = (1, 2, 3, 4, 6, 8, 12, 16)
 QUANTITIES = ("delta_e", "ssimulacra2", "butteraugli", "psnr")
 COMPARISONS = tuple(Comparison(OURS, other) for other in (*OTHERS, HASH))
 CASES = ["target_bytes"]
-# the first eight even numbers that are not upright: settings are tuned on odd ones
+# the first eight photos with even numbers that are not upright; settings were tuned on odd numbers
 FIGURE = ("disc", *(f"kodim{number:02}" for number in (2, 6, 8, 12, 14, 16, 20, 22)))
-FIGURE_HEIGHT = 170  # of a photo in it, about, in pixels
-GAP = 12  # between photos, in pixels
+FIGURE_HEIGHT = 170  # approximate height of a photo in the figure, in pixels
+GAP = 12  # gap between photos, in pixels
 METHOD = f"""Kodak's photos, reduced to {SIDE} pixels on the longer side. `kcgs` is `fit_bytes` with its default
 settings, without a map. WebP (method 6) and AVIF (speed 4) code the photo, or the photo reduced to one of
 {len(REDUCTIONS) - 1} sizes from a half to a sixteenth of each side and enlarged bicubically: of all files of at most
@@ -52,7 +52,7 @@ takes less than 0.5 s. Table: deltaE 2000 / SSIMULACRA2 / PSNR in dB. The figure
 
 
 def measure(image: str, method: str, target_bytes: int, folder: str, data: str, quick: bool) -> list[Row]:
-    """Make a preview and measure it; those of the figure are written."""
+    """Make a preview and measure it; write it if it is in the figure."""
     photo = load(image, data, quick).image
     height, width = photo.shape[1:]
     scale = SIDE / max(height, width)
@@ -80,7 +80,7 @@ def measure(image: str, method: str, target_bytes: int, folder: str, data: str, 
 
 
 def thumbhash(image: Tensor) -> tuple[int, Tensor]:
-    """Return the bytes of an image's ThumbHash, and what it shows."""
+    """Return the bytes of an image's ThumbHash, and the decoded image."""
     from fast_thumbhash import rgba_to_thumb_hash, thumb_hash_to_rgba
 
     height, width = image.shape[1:]
@@ -94,7 +94,7 @@ def thumbhash(image: Tensor) -> tuple[int, Tensor]:
 
 
 def butteraugli(render: Tensor, image: Tensor) -> float:
-    """Run the command `butteraugli`; NaN: there is none."""
+    """Run the command `butteraugli`; return NaN if it is not installed."""
     if shutil.which("butteraugli") is None:
         return math.nan
     with TemporaryDirectory() as folder:
@@ -105,7 +105,7 @@ def butteraugli(render: Tensor, image: Tensor) -> float:
 
 
 def jobs(options: Options) -> list[Job]:
-    """Make previews of Kodak's photos."""
+    """List previews of Kodak's photos."""
     images = ["disc"] if options.quick else names(options.folder(), "kodak")
     methods = [OURS, *OTHERS, *([HASH] if find_spec("fast_thumbhash") else [])]
     arguments = {"folder": str(options.output / "runs"), **options.image_arguments()}
@@ -118,7 +118,7 @@ def jobs(options: Options) -> list[Job]:
 
 
 def page(folder: Path, rows: list[Row]) -> Page:
-    """Write the report; without the images of the run the figure stays."""
+    """Write the report; if the images of the run are gone, keep the old figure."""
     rows = sorted(rows, key=lambda row: row["target_bytes"])
     figures: list[list[Tensor]] = []
     for (image,), files in group_by(rows, ["image"]).items():

@@ -16,7 +16,7 @@ METHODS: dict[str, Method] = {
 CHART_METHODS: dict[str, Method] = {**METHODS, "paper, clamp": ("paper", {"clamp": True})}
 CHART_COUNT = 20
 COUNT = 1_250
-# what the paper prints over all of DAVIS at this N: PSNR and EF-PSNR
+# means that the paper prints over all of DAVIS at this N: PSNR and EF-PSNR in dB
 PRINTED = {"paper": (27.31, 23.41), "gaussian-image": (27.29, 22.92), "gaussian-image-clamp": (27.10, 22.73)}
 QUANTITIES = ("psnr", "ef_psnr")
 CLAIMS = (Comparison("paper", "gaussian-image"), Comparison("paper", "gaussian-image-clamp"))

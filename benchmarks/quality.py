@@ -39,7 +39,7 @@ of that image."""
 
 
 def measure(image: str, group: str, n: int, data: str, quick: bool) -> list[Row]:
-    """Fit by the first method, then by the others in as much time."""
+    """Fit by the first method, then by the other methods in the same time."""
     pixels, labels = load_mapped(image, data, quick)
     rows: list[Row] = []
     for method in METHODS:

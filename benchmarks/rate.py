@@ -31,11 +31,11 @@ from .core.images import PHOTOS, load, load_mapped, names
 from .core.run import Job, Options, Page, Row
 
 PSNR, REGIONS, EYE = "kcgs, psnr, no regions", "kcgs, psnr", "kcgs"
-# map, objective
+# whether the file may hold a map, and its objective
 OURS = {PSNR: (False, "l2"), REGIONS: (True, "l2"), EYE: (True, "ms-ssim")}
 # 0.08, 0.15, 0.3, 0.5 and 0.8 bits per pixel of Kodak
 BYTES = (3_932, 7_372, 14_745, 24_576, 39_321)
-# of methods that make fewer files of Kodak; found maps for PSNR are in the report of `maps`
+# sizes for methods that make fewer files of Kodak; the report of `maps` has files for PSNR with found maps
 KODAK_BYTES = {EYE: BYTES[1:4], REGIONS: ()}
 QUICK_BYTES = (450, 900)
 QUANTITIES = (*METRICS, "ssimulacra2")
@@ -46,7 +46,7 @@ COMPARISONS = (
     *(Comparison(EYE, other) for other in ("JPEG", "WebP", "AVIF")),
 )
 CASES = ["group", "target_bytes"]
-# mean PSNR over Kodak's 24 photos, as the authors of these codecs printed them
+# mean PSNR in dB over Kodak's 24 photos, as published by the authors of these codecs
 PRINTED = {
     "VTM": (27.55, 29.49, 32.08, 34.37),
     "C3": (27.06, 29.05, 31.71, 34.22),
@@ -64,7 +64,7 @@ bytes). Losses are at equal bits: the other's quality is interpolated between it
 
 
 def measure(image: str, group: str, method: str, sizes: list[int], data: str, quick: bool) -> list[Row]:
-    """Make files and measure them; searches of a codec for several sizes share what they try."""
+    """Make files and measure them; the searches of a codec for several sizes share their trial files."""
     pixels, labels = load(image, data, quick)
     rows = []
     for target_bytes in sizes:
@@ -85,7 +85,7 @@ def measure(image: str, group: str, method: str, sizes: list[int], data: str, qu
 
 
 def jobs(options: Options) -> list[Job]:
-    """Make files of DAVIS and Kodak; without data, of photos of scikit-image."""
+    """List files of DAVIS and Kodak; without data, of photos of scikit-image."""
     arguments, codecs = options.image_arguments(), available_codecs()
     if options.quick:
         methods = (PSNR, EYE, *codecs)
@@ -106,10 +106,10 @@ def jobs(options: Options) -> list[Job]:
 
 
 def bd_rate(ours: list[Row], other: list[Row], quantity: str = "psnr") -> float | None:
-    """Return how many % more bytes ours takes for the same quality, Bjontegaard's measure; None: no overlap."""
+    """Return how many % more bytes `ours` takes for the same quality (Bjontegaard); None: the curves do not overlap."""
     curves: list[tuple[float, float, Callable[..., float]]] = []
     for rows in (ours, other):
-        # a file that a smaller one beats is no part of the curve
+        # the curve leaves out a file if a smaller file is better
         rising: list[tuple[float, float]] = []
         for row in sorted(rows, key=lambda row: row["bytes"]):
             if not rising or row[quantity] > rising[-1][0]:

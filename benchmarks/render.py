@@ -25,9 +25,9 @@ from .core.scenes import FITTED, scene_of
 CUTOFFS = (1 / 255, 1e-3, 1e-4, 1e-6)
 DEFAULT_CUTOFF = 1e-4
 ROUNDS = 9
-# numbers of cores, as far as the machine has them
+# numbers of cores to time, as far as the machine has them
 CORES = (1, 2, 4, 8, 16)
-# the dense reference needs memory for all pairs of Gaussians and pixels
+# most pairs of a Gaussian and a pixel: the dense reference holds all pairs in memory
 LARGEST_REFERENCE = 2_000_000_000
 ANISOTROPIES = (1.0, 1e2, 1e4, 1e6)
 NEEDLES_SIZE = (96, 128)
@@ -51,12 +51,12 @@ def render(scene: Scene, backend: str, cutoff: float) -> Tensor:
 
 @functools.cache
 def smooth_gradient(shape: torch.Size, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Make a gradient of both signs, once, since that takes as long as a render."""
+    """Make a gradient with values of both signs; it is cached, because making it takes as long as a render."""
     return torch.cos(torch.linspace(-40, 40, shape.numel(), dtype=dtype, device=device)).view(shape)
 
 
 def differentiate(scene: Scene, backend: str, cutoff: float) -> tuple[Tensor, list[Tensor]]:
-    """Return the image, and the gradients of means, cholesky and colors under a smooth gradient of both signs."""
+    """Return the image, and the gradients of means, cholesky and colors for the image gradient `smooth_gradient`."""
     scene.zero_grad(set_to_none=True)
     image = render(scene, backend, cutoff)
     image.backward(smooth_gradient(image.shape, image.dtype, image.device))
@@ -65,12 +65,12 @@ def differentiate(scene: Scene, backend: str, cutoff: float) -> tuple[Tensor, li
 
 
 def render_by_name(name: str, backend: str) -> None:
-    """Render and differentiate a scene, for a clock of memory."""
+    """Render and differentiate a scene in a process whose memory is measured."""
     differentiate(scene_of(name), backend, DEFAULT_CUTOFF)
 
 
 def needles(anisotropy: float, width: float = 0.5) -> Scene:
-    """Make Gaussians of one shape, turned from 0 to pi, of this least standard deviation in pixels."""
+    """Make Gaussians of one shape, turned from 0 to pi; `width` is their lesser standard deviation in pixels."""
     angle = torch.linspace(0, math.pi, 37, dtype=torch.float64)
     scales = torch.tensor([width * anisotropy, width], dtype=torch.float64).expand(37, 2)
     generator = torch.Generator().manual_seed(0)
@@ -85,7 +85,7 @@ def differentiate_exactly(scene: Scene) -> tuple[Tensor, list[Tensor]]:
 
 
 def errors(truth: tuple[Tensor, list[Tensor]], scene: Scene, backend: str, cutoff: float) -> dict[str, float]:
-    """Return the largest errors against `differentiate_exactly`."""
+    """Return the largest errors of a backend against `differentiate_exactly`."""
     exact, exact_gradients = truth
     image, gradients = differentiate(scene, backend, cutoff)
     pairs = zip(gradients, exact_gradients, strict=True)
@@ -94,7 +94,7 @@ def errors(truth: tuple[Tensor, list[Tensor]], scene: Scene, backend: str, cutof
 
 
 def on_threads(count: int, action: Callable[[], object]) -> None:
-    """Run on so many threads."""
+    """Run an action on `count` threads."""
     with threads(count):
         action()
 
@@ -106,7 +106,7 @@ def cores() -> list[int]:
 
 
 def measure(image: str, cutoffs: list[float], rounds: int) -> list[Row]:
-    """Time a scene on one thread and on more, in turns; on one, take errors and memory, too."""
+    """Time a scene on one thread and on more, in turns; on one thread also measure errors and memory."""
     if image.startswith("needles"):
         scene = needles(float(image.split()[1]))
         truth, row = differentiate_exactly(scene), {"image": image, "threads": 1, "cutoff": 0.0}
@@ -130,12 +130,12 @@ def measure(image: str, cutoffs: list[float], rounds: int) -> list[Row]:
 
 
 def backends() -> list[str]:
-    """Name the backends that run on a CPU; `gpu` times the others."""
+    """Return the names of the backends that run on a CPU; the experiment `gpu` times the others."""
     return ["cpu", "tiled"]
 
 
 def jobs(options: Options) -> list[Job]:
-    """Time workloads and fitted scenes, and look at needles."""
+    """List timings of workloads and fitted scenes, and errors of needles."""
     swept = ["W3"] if options.quick else ["W3", "W1", *FITTED]
     images = [*swept, *([] if options.quick else ["W2", "W4"])]
     listing = [{"image": image, "cutoffs": CUTOFFS if image in swept else (DEFAULT_CUTOFF,)} for image in images]

@@ -23,7 +23,7 @@ again: the mean PSNR differs by at most 0.03 dB.
 stopped. `DATA` has the folders `DAVIS`, `bsds`, `kodak` and `cocostuff`; without it photos of scikit-image are
 measured. `--only` chooses images.
 """
-# by their own programs, which are not part of kcgs; the rows of kcgs are those of the reports gpu and gpu-fit
+# measured with the authors' programs, which are not part of kcgs; rows of kcgs are from the reports gpu and gpu-fit
 PEERS = f"""
 ## How fast are GaussianImage and Image-GS themselves?
 

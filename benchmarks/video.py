@@ -33,7 +33,7 @@ core, per frame. The figure follows the PSNR along the frames, in the mean over 
 
 
 def measure(image: str, n: int, data: str, quick: bool) -> list[Row]:
-    """Fit a sequence both ways; a row for each frame."""
+    """Fit a sequence as a video and frame by frame; return a row for each frame."""
     frames, maps = read_sequence(image, data, quick)
     count, length = len(frames), {"iterations": QUICK_ITERATIONS} if quick else {}
     config, rows = FitConfig.from_recipe("best", **length), []
@@ -56,7 +56,7 @@ def measure(image: str, n: int, data: str, quick: bool) -> list[Row]:
 
 
 def read_sequence(image: str, data: str, quick: bool) -> tuple[list[Tensor], list[Tensor]]:
-    """Read a sequence and its maps; in the quick form, make a disc that moves."""
+    """Read a sequence and its maps; the quick form makes a moving disc."""
     if quick:
         sample = load(image, data, quick)
         assert sample.labels is not None
@@ -68,13 +68,13 @@ def read_sequence(image: str, data: str, quick: bool) -> tuple[list[Tensor], lis
 
 
 def difference_of_steps(renders: tuple[Tensor, Tensor], frames: tuple[Tensor, Tensor]) -> float:
-    """Return how much two steps differ, in levels of 8 bits."""
+    """Return the mean difference between changes of renders and changes of frames, in 8-bit levels."""
     steps = [after.clamp(0, 1) - before.clamp(0, 1) for before, after in (renders, frames)]
     return 255 * float((steps[0] - steps[1]).abs().mean())
 
 
 def jobs(options: Options) -> list[Job]:
-    """Fit the sequences of DAVIS that have frames enough."""
+    """List the sequences of DAVIS that have enough frames."""
     if options.quick:
         return [{"image": "disc", "n": 40, **options.image_arguments()}]
     folders = sorted((options.folder() / "DAVIS/JPEGImages/480p").iterdir())

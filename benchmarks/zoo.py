@@ -15,14 +15,14 @@ from .core.fits import QUICK_ITERATIONS
 from .core.images import CHARTS, load_mapped
 from .core.run import Options
 
-PREVIEW = 384  # pixels of its longer side
+PREVIEW = 384  # longer side of a preview, in pixels
 _CHART = "Apache-2.0, made by kcgs"
 _NASA = "public domain (NASA), from scikit-image"
 _CC0 = "CC0, from scikit-image"
 
 
 class Plan(NamedTuple):
-    """An image, how many Gaussians, what it shows, and on what terms."""
+    """An image of the zoo: its number of Gaussians, its title and its licence."""
 
     image: str
     n: int
@@ -42,7 +42,7 @@ PLANS: dict[str, Plan] = {
 
 
 def make_zoo(options: Options) -> None:
-    """Fit the scenes, or those that `only` names, and write them with their manifest."""
+    """Fit all scenes, or the scenes that `only` names, and write them with their manifest."""
     unknown = [name for name in options.only if name not in PLANS]
     if unknown:
         raise ValueError(f"only must name scenes of the zoo, {', '.join(PLANS)}; got {unknown[0]!r}")
@@ -57,7 +57,7 @@ def make_zoo(options: Options) -> None:
 def make_entry(name: str, plan: Plan, folder: Path, quick: bool) -> Entry:
     """Fit a scene and write its files."""
     image, labels = load_mapped(plan.image)
-    recipe = "best" if plan.image in CHARTS else "best-refined"  # contours that were found may move freely
+    recipe = "best" if plan.image in CHARTS else "best-refined"  # contours from `segment` may move any distance
     config = FitConfig.from_recipe(recipe, **({"iterations": QUICK_ITERATIONS} if quick else {}))
     folder.mkdir(parents=True, exist_ok=True)
     fitted = fit(image, labels, plan.n, recipe=config).scene
