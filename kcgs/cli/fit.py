@@ -141,12 +141,11 @@ def save_result(
 
     scene, config = Scene(result.scene.field, result.scene.regions, {"recipe": request.recipe}), request.load_config()
     is_rounded = output.suffix == ".kcgs"
-    rounding: dict[str, Any] = {}
-    if is_rounded:
-        rounding = {"image": image, "seed": request.seed}
-        rounding |= {"target_psnr": config.target_psnr, "objective": config.objective}
+    rounding: dict[str, Any] = {
+        "image": image, "seed": request.seed, "target_psnr": config.target_psnr, "objective": config.objective
+    }  # fmt: skip
     with Progress("writing the file", pulse=True, visible=progress and is_rounded):
-        num_bytes = scene.save(output, **rounding)
+        num_bytes = scene.save(output, **(rounding if is_rounded else {}))
     return load(output), num_bytes
 
 

@@ -121,7 +121,7 @@ def _fit_and_save(part: ShardPart, loaded: dict[int, Loaded], errors: dict[int, 
         fits = fit_batch([*loaded.values()], request)
     except Exception as error:  # images and maps were read, so the error is of the whole part
         return {index: Outcome({"error": describe_error(error)}, True) for index in loaded}
-    with_maps = part.images[0].regions != "none"
+    with_maps = any(one.labels is not None for one in loaded.values())
     singles = [fit.result.scene for fit in fits]
     scenes = stack_scenes(singles, request.count_for(*singles[0].size), with_maps=with_maps)
     field = reorder_rows(scenes.field, rank_gaussians(scenes.field, scenes.regions))

@@ -281,6 +281,11 @@ class TestBatches:
             assert code == 2 and f"left out with {option}" in err
         assert fit_many("photos", *SETTINGS, "--batch", "some").code == 2
 
+    def test_an_objective_that_files_lack_is_refused_before_the_fits(self, fit_many: Kcgs) -> None:
+        long = ("-n", "12", "--iterations", "1000000000", "-o", "out")
+        code, _, err = fit_many("photos", *long, "--suffix", ".kcgs", "--objective", "l1")
+        assert code == 2 and "must be l2 or ms-ssim for a file of a PSNR; got 'l1'" in err and not Path("out").exists()
+
     def test_an_error_of_the_fit_stops_one_image(self, fit_many: Kcgs, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(many_jobs, "fit_batch", lambda *_: 1 / 0)
         code, out, _ = fit_many("photos", *SETTINGS, "--json")
@@ -300,6 +305,11 @@ def _orientation(value: int) -> Image.Exif:
 
 class TestShards:
     ARGUMENTS = ("photos", "broken", *SETTINGS, "--shard", "2", "--batch", "1", "--json")
+
+    def test_small_images_have_no_maps(self, fit_many: Kcgs) -> None:
+        assert fit_many("photos", *FIT, "--shard", "4").code == 0
+        scenes = load("out/00000.safetensors")
+        assert scenes.num_images == 3 and scenes.regions is None and scenes.field.region_ids is None
 
     def test_shards_hold_what_files_hold(self, fit_many: Kcgs) -> None:
         code, out, err = fit_many(*self.ARGUMENTS)
@@ -380,7 +390,9 @@ class TestShards:
     def test_maps_and_sizes(self, fit_many: Kcgs) -> None:
         """A shard has images of one size, each with its map."""
         Image.new("RGB", (20, 30), "red").save("photos/tall.png")
-        code, _, err = fit_many("photos", *FIT, "--shard", "9")
+        for name, size in (("c", (24, 36)), ("tall", (30, 20))):  # a and b have masks
+            save_labels(f"masks/{name}.png", (torch.arange(size[1]) > 9).long().expand(size))
+        code, _, err = fit_many("photos", *FIT, "--regions", "masks", "--shard", "9")
         assert code == 0, err
         dataset = SceneDataset("out")
         assert dataset.names == ["a.png", "b.png", "c.png", "tall.png"]
