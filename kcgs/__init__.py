@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from .pruning import prune
     from .scene import Scene
 
-__version__ = "0.3.0"
+__version__ = "0.4.0"
 
 __all__ = [
     "FitConfig", "FitResult", "GaussianField", "InvalidArgument", "InvalidArgumentType", "RegionMap",

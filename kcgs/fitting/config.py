@@ -6,7 +6,7 @@ import math
 import tomllib
 from difflib import get_close_matches
 from importlib.resources import files
-from typing import Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
@@ -20,8 +20,10 @@ _USUAL_ITERATIONS = 700
 # settings of version 0.3, and what replaces each
 _RENAMED = {
     "loss": "it is objective now, with the same values",
-    "densify": "it is an argument of fit now, an event of your own; 'largest-error' is in benchmarks/core/image_gs.py",
+    "densify": "it is an argument of fit, an event of your own; None is matching pursuit, and 'largest-error' is in "
+    "benchmarks/core/image_gs.py",
 }
+_RENAMED_PROPERTIES = {"num_iterations": "planned_iterations", "max_iterations": "iteration_limit"}
 # values of version 0.3
 _VALUES_OF_IMAGE_GS = ("image-gs", "gradient", "adam")
 
@@ -147,6 +149,13 @@ class FitConfig(BaseModel):
     def iteration_limit(self) -> float:
         """Largest number of iterations; infinite where only the clock ends the fit."""
         return math.inf if self.iterations is None and self.max_seconds is not None else self.planned_iterations
+
+    if not TYPE_CHECKING:  # for a type checker, any name would exist
+
+        def __getattr__(self, name: str) -> Any:
+            if name in _RENAMED_PROPERTIES:
+                raise AttributeError(f"{name} of a FitConfig is {_RENAMED_PROPERTIES[name]} now")
+            return super().__getattr__(name)
 
     def __repr__(self) -> str:
         changed = [(name, value) for name, value in self if value != type(self).model_fields[name].default]

@@ -61,9 +61,7 @@ NO_OBJECTS = UserObjects()
 
 def split_names(**arguments: object) -> tuple[dict[str, Any], UserObjects]:
     """Split the arguments of a fit into settings (names) and the user's objects."""
-    settings: dict[str, Any] = {
-        name: value for name, value in arguments.items() if isinstance(value, str) and name != "densify"
-    }
+    settings: dict[str, Any] = {name: value for name, value in arguments.items() if isinstance(value, str)}
     objects = UserObjects(**{name: value for name, value in arguments.items() if name not in settings})  # type: ignore[arg-type]
     for name, value in objects._asdict().items():
         if name != "densify" and value is not None and not callable(value):

@@ -339,7 +339,7 @@ class TestErrors:
                 {"objective": "l1+ssim"},
                 "^objective must be .*, which is now a function of benchmarks/core/",
             ),
-            ({"densify": "largest-error"}, "^unknown setting 'densify': it is an argument of fit now, .*image_gs.py$"),
+            ({"densify": "largest-error"}, "^unknown setting 'densify': it is an argument of fit, .*image_gs.py$"),
             ({"initializer": "gradient"}, "^initializer must be .*; got 'gradient', which is now in benchmarks/core/"),
             ({"optimizer": "adam"}, "^optimizer must be .* or 'adan'; got 'adam', which is now in benchmarks/core/"),
             ({"optimizer": object()}, "^optimizer must be 'gaussian-adam' or 'adan'; got "),
