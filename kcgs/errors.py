@@ -1,6 +1,6 @@
 """Errors that name the argument; they survive pickling, so that worker processes can raise them.
 
-They are raised where a command answers with the name of an option in place of the argument. Elsewhere a plain
+A command replaces the name of the argument by that of its option. Where no command meets the error, a plain
 `ValueError` or `TypeError` has a message of the same form.
 """
 

@@ -115,15 +115,18 @@ def map_file(path: str | os.PathLike[str]) -> MappedScene:
             notes = file.metadata() or {}
         if not {*_REQUIRED} <= tensors.keys() or tensors["means"].ndim != 3:
             raise ValueError(f"it must hold {', '.join(_REQUIRED)} of a batch; got {sorted(tensors)}")
-        return MappedScene(tensors, json.loads(notes[FORMAT]))
+        if "opacities" in tensors:
+            raise ValueError("shards hold no opacities: kcgs.data.save_shard merges them into the colours")
+        header = json.loads(notes[FORMAT])
+        _check_version(header)
+        return MappedScene(tensors, header)
     except (KeyError, safetensors.SafetensorError, TypeError, ValueError) as error:
         raise ValueError(f"{path} holds no batch of scenes: {error}") from error
 
 
 def _assemble(tensors: dict[str, Tensor], header: Any) -> Scene:
     """Validate the contents of a file and copy them into a scene."""
-    if header["version"] != VERSION:
-        raise ValueError(f"its version must be {VERSION}; got {header['version']!r}")
+    _check_version(header)
     missing, unknown = {*_REQUIRED} - tensors.keys(), tensors.keys() - {*_REQUIRED, *_OPTIONAL}
     if missing or unknown:
         raise ValueError(f"it must hold {', '.join(_REQUIRED)}; missing: {sorted(missing)}, unknown: {sorted(unknown)}")
@@ -144,6 +147,11 @@ def _assemble(tensors: dict[str, Tensor], header: Any) -> Scene:
         softness = softness_from_plain(header["softness"])
         regions = RegionMap.from_labels(_inflate(tensors["labels"], **header["labels"]), softness)
     return Scene(field, regions, header["notes"])
+
+
+def _check_version(header: dict[str, Any]) -> None:
+    if header["version"] != VERSION:
+        raise ValueError(f"its version must be {VERSION}; got {header['version']!r}")
 
 
 def _checksum(tensors: dict[str, Tensor], header: dict[str, Any]) -> int:

@@ -178,7 +178,7 @@ def save_shard(
 
     Args:
         path: 00000.safetensors, 00001.safetensors and so on.
-        scenes: of images of one size.
+        scenes: of images of one size; opacities are merged into the colours.
         names: of the images.
         psnr: of the scenes, in dB, such as `psnr` of :class:`kcgs.FitResult`.
         metadata: more notes for the file.
@@ -202,7 +202,9 @@ def save_shard(
     # JSON has no infinity, the PSNR of an image without error
     finite = [number if math.isfinite(number) else None for number in numbers]
     notes = {**(metadata or {}), "names": json.dumps([*names]), "psnr": json.dumps(finite)}
-    return Scene(scenes.field, scenes.regions, notes).save(path)
+    field = scenes.field
+    field = GaussianField(field.means, field.cholesky, field.merged_colors(), field.region_ids, size=field.size)
+    return Scene(field, scenes.regions, notes).save(path)
 
 
 def shard_contents(metadata: Mapping[str, str], path: Path) -> tuple[list[str], list[float]]:
@@ -215,7 +217,7 @@ def shard_contents(metadata: Mapping[str, str], path: Path) -> tuple[list[str], 
 
 
 def stack_scenes(scenes: Sequence[Scene], num_gaussians: int, *, with_maps: bool) -> Scene:
-    """Stack unbatched scenes of one size into a batch of `num_gaussians` rows each, without opacities.
+    """Stack unbatched scenes of one size into a batch of `num_gaussians` rows each; opacities are merged into the colours.
 
     `with_maps`: a scene without a label map gets a map of one region.
     """

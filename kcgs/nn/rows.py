@@ -40,7 +40,7 @@ def join(first: GaussianField, second: GaussianField) -> GaussianField:
 
 
 def pad_rows(field: GaussianField, count: int, regions: RegionMap | None = None) -> GaussianField:
-    """Pad a field without opacities with black Gaussians to `count` per image, without the graph.
+    """Pad a field with black Gaussians to `count` per image, without the graph; opacities are merged into the colours.
 
     The new Gaussians have the region of the image's first Gaussian or, with a map, the map's first region. With a map,
     all Gaussians of a field without ids get the map's first region.
@@ -48,7 +48,7 @@ def pad_rows(field: GaussianField, count: int, regions: RegionMap | None = None)
     missing, ids = count - field.num_gaussians, field.region_ids
     means, cholesky, colors = (
         pad(table.detach(), (0, 0, 0, missing), value=fill)
-        for table, fill in ((field.means, 1.0), (field.cholesky, 1.0), (field.colors, 0.0))
+        for table, fill in ((field.means, 1.0), (field.cholesky, 1.0), (field.merged_colors(), 0.0))
     )
     if regions is not None and ids is None:
         ids = regions.ids[:1].expand(means.shape[:-1])
@@ -59,11 +59,11 @@ def pad_rows(field: GaussianField, count: int, regions: RegionMap | None = None)
 
 
 def reorder_rows(field: GaussianField, order: Tensor) -> GaussianField:
-    """Return the rows of a field without opacities in another order, (N,) or (B, N), without the graph."""
+    """Return the rows in another order, (N,) or (B, N), without the graph; opacities are merged into the colours."""
     index = order[..., None]
     means, cholesky, colors = (
         table.detach().gather(-2, index.expand(*order.shape, table.shape[-1]))
-        for table in (field.means, field.cholesky, field.colors)
+        for table in (field.means, field.cholesky, field.merged_colors())
     )
     ids = None if field.region_ids is None else field.region_ids.gather(-1, order)
     return GaussianField(means, cholesky, colors, ids, size=field.size)

@@ -134,3 +134,13 @@ def test_indices_and_devices(tmp_path: Path) -> None:
         dataset[1:3]  # type: ignore[index]
     with pytest.raises(IndexError):
         dataset.__getitems__([7])
+
+
+def test_opacities_are_merged_into_the_colors(tmp_path: Path) -> None:
+    field = scenes_of(2).field
+    scenes = Scene(GaussianField(field.means, field.cholesky, field.colors, None, torch.full((2, 9), 0.5), size=SIZE))
+    save_shard(tmp_path / "00000.safetensors", scenes, ["a", "b"], [20.0, 21.0])
+    torch.testing.assert_close(SceneDataset(tmp_path)[1].render(), scenes[1].render())
+    scenes.save(tmp_path / "00000.safetensors")
+    with pytest.raises(ValueError, match="merges them into the colours"):
+        SceneDataset(tmp_path)
