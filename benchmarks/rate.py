@@ -26,7 +26,7 @@ from .core.compare import (
     values_of,
 )
 from .core.figures import Panel, save_lines
-from .core.fits import METRICS, QUICK_ITERATIONS, measure_render
+from .core.fits import QUICK_ITERATIONS, REPORTED, measure_render
 from .core.images import PHOTOS, load, load_mapped, names
 from .core.run import Job, Options, Page, Row
 
@@ -38,7 +38,7 @@ BYTES = (3_932, 7_372, 14_745, 24_576, 39_321)
 # sizes for methods that make fewer files of Kodak; the report of `maps` has files for PSNR with found maps
 KODAK_BYTES = {EYE: BYTES[1:4], REGIONS: ()}
 QUICK_BYTES = (450, 900)
-QUANTITIES = (*METRICS, "ssimulacra2")
+QUANTITIES = (*REPORTED, "ssimulacra2")
 AVIF_PSNR = "AVIF, tune=psnr"
 COMPARISONS = (
     Comparison(REGIONS, PSNR),

@@ -97,7 +97,9 @@ class FitRequest(NamedTuple):
 def fit_request(
     num_gaussians: Annotated[
         int | None,
-        typer.Option("-n", "--num-gaussians", min=1, help="Number of Gaussians; default: 100, or one per 100 pixels."),
+        typer.Option(
+            "-n", "--num-gaussians", min=1, help="Number of Gaussians; default: 1 per 100 pixels, at least 100."
+        ),
     ] = None,
     recipe: Annotated[str, typer.Option(help="Recipe by name.")] = "best",
     iterations: Annotated[

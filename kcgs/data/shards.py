@@ -217,9 +217,9 @@ def shard_contents(metadata: Mapping[str, str], path: Path) -> tuple[list[str], 
 
 
 def stack_scenes(scenes: Sequence[Scene], num_gaussians: int, *, with_maps: bool) -> Scene:
-    """Stack unbatched scenes of one size into a batch of `num_gaussians` rows each; opacities are merged into the colours.
+    """Stack unbatched scenes of one size into a batch of `num_gaussians` rows each.
 
-    `with_maps`: a scene without a label map gets a map of one region.
+    Opacities are merged into the colours. `with_maps`: a scene without a label map gets a map of one region.
     """
     if not with_maps:
         return Scene(GaussianField.stack([pad_rows(scene.field, num_gaussians) for scene in scenes]))

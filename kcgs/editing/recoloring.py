@@ -42,7 +42,7 @@ def recolor_region(
     bias: Numbers | None = None,
     *,
     color: str | Numbers | None = None,
-    strength: float = _STRENGTH,
+    strength: float | None = None,
 ) -> Scene:
     r"""Change the colours of regions in the image to c' = gain c + bias, or give them another colour.
 
@@ -58,7 +58,7 @@ def recolor_region(
         gain: a number, a number for each channel :math:`(C)`, or a matrix :math:`(C, C)`: tensors, arrays or lists.
         bias: a number, or a number for each channel :math:`(C)`; None: no Gaussian is added.
         color: in place of gain and bias, a name such as "red" or "#ff0000", or a number for each channel :math:`(C)`.
-        strength: share of the new colour, in [0, 1]; the rest is the old colour. Ignored without `color`.
+        strength: share of the new colour, in [0, 1]; the rest is the old colour; None: 0.75. With `color` only.
 
     Returns:
         A new scene, without a graph.
@@ -82,8 +82,10 @@ def recolor_region(
     if (color is None) == (gain is None and bias is None):
         raise ValueError("color must be given, or gain or bias; got both or neither")
     if color is None:
+        if strength is not None:
+            raise InvalidArgument("strength", "None without color", strength)
         return _recolor(scene, ids, 1.0 if gain is None else gain, bias)
-    check_number("strength", strength, 0, 1)
+    strength = check_number("strength", _STRENGTH if strength is None else strength, 0, 1)
     for region_id in ids:
         scene = _paint(scene, region_id, color, strength)
     return scene

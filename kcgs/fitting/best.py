@@ -20,7 +20,7 @@ class Best(NamedTuple):
     field: GaussianField
     """A batch of copies; rows that a scene lacks have the colour 0."""
     maps: list[RegionMap | None]
-    """For each image the map of its render, or a batch of maps that holds this map at the image's index."""
+    """For each image the map of its render, which may be a batch of maps with this map at the image's index."""
     is_draft: Tensor
     """True for a scene rendered with the draft cutoff: all with the final cutoff rank higher. Bool, (B,)."""
     value: Tensor

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
 
 from kcgs.nn import GaussianField
-from kcgs.optim import COLOR_LEARNING_RATE, LEARNING_RATE, GaussianAdam
+from kcgs.optim import COLOR_LEARNING_RATE, LEARNING_RATE, FieldOptimizer, GaussianAdam
 
 from .config import FitConfig
 from .problem import Problem
@@ -13,7 +13,7 @@ from .published.gaussian_image import GaussianImageAdan
 from .user_objects import check_optimizer
 
 
-def make_optimizer(problem: Problem, field: GaussianField, sigma: float) -> Any:
+def make_optimizer(problem: Problem, field: GaussianField, sigma: float) -> FieldOptimizer:
     """Return the optimizer of a field whose Gaussians begin with `sigma`, in pixels."""
     if problem.objects.optimizer is not None:
         return check_optimizer(problem.objects.optimizer(field))
@@ -35,4 +35,7 @@ def _adan(config: FitConfig, field: GaussianField, sigma: float) -> GaussianImag
     return GaussianImageAdan(field, sigma, config.planned_iterations, config.learning_rate_factor)
 
 
-_OPTIMIZERS = {"gaussian-adam": _gaussian_adam, "adan": _adan}
+_OPTIMIZERS: dict[str, Callable[[FitConfig, GaussianField, float], FieldOptimizer]] = {
+    "gaussian-adam": _gaussian_adam,
+    "adan": _adan,
+}

@@ -10,11 +10,10 @@ from torch import Tensor
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
-from kcgs.optim import Event, Loss
+from kcgs.optim import Event, FieldOptimizer, Loss
 
 Initializer = Callable[[Tensor, int, RegionMap | None, int], GaussianField]
-# members of an optimizer that a fit reads, besides its methods
-_FIT_MEMBERS = ("rate", "has_drafts", "keeps_averages")
+_OPTIMIZER_MEMBERS = tuple(name for name in vars(FieldOptimizer) if not name.startswith("_"))
 
 
 @runtime_checkable
@@ -52,8 +51,7 @@ class UserObjects(NamedTuple):
     initializer: Initializer | None = None
     """Function from images, (B, C, H, W), a number of Gaussians, a map or None, and a seed to a batch of fields."""
     densify: Densifier | None = None
-    optimizer: Callable[[GaussianField], Any] | None = None
-    """Function from a field to an optimizer with the methods of GaussianAdam."""
+    optimizer: Callable[[GaussianField], FieldOptimizer] | None = None
 
 
 NO_OBJECTS = UserObjects()
@@ -92,9 +90,9 @@ def _layout(colors: tuple[int, ...], size: tuple[int, ...], has_ids: bool) -> st
     return f"colors {colors}, size {size} and {'' if has_ids else 'no '}region_ids"
 
 
-def check_optimizer(optimizer: Any) -> Any:
-    """Validate that a user's optimizer has the members that a fit reads."""
-    if missing := [name for name in _FIT_MEMBERS if not hasattr(optimizer, name)]:
-        expected = f"a function that returns an optimizer with {', '.join(_FIT_MEMBERS)}"
+def check_optimizer(optimizer: FieldOptimizer) -> FieldOptimizer:
+    """Validate that a user's optimizer has all members of a FieldOptimizer."""
+    if missing := [name for name in _OPTIMIZER_MEMBERS if not hasattr(optimizer, name)]:
+        expected = f"a function that returns an optimizer with {', '.join(_OPTIMIZER_MEMBERS)}"
         raise InvalidArgument("optimizer", expected, f"{type(optimizer).__name__} without {', '.join(missing)}")
     return optimizer

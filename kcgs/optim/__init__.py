@@ -1,7 +1,7 @@
 """Optimizers of Gaussians."""
 
 from .adam import is_within
-from .descent import FieldState, move_field, set_rates, step_field
+from .descent import FieldOptimizer, FieldState, move_field, set_rates, step_field
 from .gaussian_adam import COLOR_LEARNING_RATE, LEARNING_RATE, GaussianAdam
 from .gaussians import Gaussians, Renderer, draft_cutoff
 from .ms_ssim import MsSsim
@@ -12,4 +12,4 @@ from .reparametrized import ReparametrizedOptimizer
 from .run import End, Event, TimedAction, cosine_decay, count_iterations, run
 
 # public; what else is imported here is for the other rooms of kcgs
-__all__ = ["GaussianAdam", "ReparametrizedOptimizer"]
+__all__ = ["FieldOptimizer", "GaussianAdam", "ReparametrizedOptimizer"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 from torch import Tensor
 
@@ -14,14 +14,52 @@ from .gaussians import Gaussians, Renderer
 from .objectives import Objective
 
 
+class FieldOptimizer(Protocol):
+    """What a fit calls of an optimizer, as :class:`GaussianAdam` has it; masks are bool, (..., N)."""
+
+    @property
+    def param_groups(self) -> list[dict[str, Any]]:
+        """The groups, whose "lr" a fit sets before each step."""
+
+    @property
+    def has_drafts(self) -> bool:
+        """Whether most of a fit may render with a larger cutoff."""
+
+    @property
+    def keeps_averages(self) -> bool:
+        """Whether averages outlive a change of the number of Gaussians, so that a fit may go on from a finished one."""
+
+    def rate(self, progress: float) -> float:
+        """Return the factor of the initial learning rates at a share of the fit."""
+
+    def step(self) -> Any:
+        """Move the Gaussians by the gradients of the field's parameters."""
+
+    def append(self, field: GaussianField, added: GaussianField) -> None:
+        """Add the Gaussians of another field."""
+
+    def keep(self, field: GaussianField, mask: Tensor) -> None:
+        """Remove all Gaussians but those of a mask."""
+
+    def freeze(self, field: GaussianField, mask: Tensor) -> None:
+        """Leave the Gaussians of a mask as they are from here on."""
+
+    def frozen_rows(self, field: GaussianField) -> Tensor:
+        """Return the mask of the frozen Gaussians."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a checkpoint stores."""
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take what `state_dict` returned."""
+
+
 @dataclass
 class FieldState:
     """A field that an optimizer moves; events may replace the map, and add and remove Gaussians."""
 
     field: GaussianField
-    optimizer: Any
-    """A GaussianAdam, or an object with its `param_groups`, `step`, `append`, `keep`, `state_dict`, `load_state_dict`,
-    and for a batch `freeze` and `frozen_rows`; in a fit also its `rate`, `has_drafts` and `keeps_averages`."""
+    optimizer: FieldOptimizer
     objective: Objective
     renderer: Renderer
     iteration: int = 0

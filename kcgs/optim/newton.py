@@ -11,8 +11,9 @@ from .frame import local_gradient, move, widen
 from .gaussians import Gaussians, Renderer
 from .objectives import Objective
 
-# half the second derivatives of the squared error by a step in a Gaussian's frame, per energy of the Gaussian: two of
-# the centre, three of the factor (docs/format.md has the derivation)
+# half the second derivatives of the squared error by a step in a Gaussian's frame, per energy of the Gaussian, its
+# integral of the square: two of the centre, three of the factor. With w the Gaussian and (u, v) whitened coordinates,
+# the mean of (u w)^2 per w^2 is 1/2, of (u^2 w)^2 is 3/4, of (u v w)^2 is 1/4
 _CURVATURE = (0.5, 0.5, 0.75, 0.25, 0.75)
 # least energy of a Gaussian in a step: with less, the error would have next to no curvature
 _MIN_ENERGY = 1e-2

@@ -135,6 +135,7 @@ class TestEditing(BaseTester):
                 "color must be given, or gain or bias; got both or neither",
             ),
             (lambda s: recolor_region(s, BOX, 1.0, color="red"), ValueError, "got both or neither"),
+            (lambda s: recolor_region(s, BOX, 1.0, strength=0.5), ValueError, "strength must be None without color"),
             (lambda s: recolor_region(s, BOX, color="reddish"), ValueError, "color must be a name such as red"),
             (lambda s: recolor_region(s, BOX, color=[1.0, 0.0]), ValueError, r"color must have shape \(3,\)"),
             (lambda s: recolor_region(Scene(s.field), BOX, color="red"), ValueError, "scene must have a label map"),
