@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 WORKERS ?= 2
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
-.PHONY: page wheel demo report test test-all notebooks docs lint clean
+.PHONY: page wheel demo report test test-all gpu notebooks docs lint clean
 
 # The stamp is newer than what it was made from, or the environment is made again. Modules are compiled when they are first
 # imported: most of them never are.
@@ -36,6 +36,14 @@ test: $(VENV)/.installed
 test-all: $(VENV)/.installed
 	$(PYTEST)
 
+# On a machine with a GPU, in an environment of your own that has torch for it, since this project's has a CPU's: the tests
+# that need a GPU, and the reports that have a part of it. DATA is the folder of images, as in docs/results.md.
+GPU_REPORTS := gpu gpu-fit batch many render
+gpu:
+	$(PYTHON) -m pytest -q --device all tests/kernels tests/optim tests/functional tests/fitting/test_on_device.py \
+	  tests/fitting/test_pursuit.py tests/maps/test_tiles.py
+	for name in $(GPU_REPORTS); do $(PYTHON) -m benchmarks $$name -o gpu-reports/$$name $(if $(DATA),--data $(DATA)) || exit 1; done
+
 notebooks: $(VENV)/.installed
 	$(BIN)/python notebooks/execute.py
 
@@ -50,4 +58,4 @@ lint: $(VENV)/.installed
 	$(BIN)/mypy
 
 clean:
-	rm -rf demo report dist build docs/_build docs/generated docs/notebooks docs/benchmarks .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf demo report gpu-reports dist build docs/_build docs/generated docs/notebooks docs/benchmarks .pytest_cache .mypy_cache .ruff_cache .hypothesis

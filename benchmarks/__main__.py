@@ -10,7 +10,7 @@ from .core.run import Options, run_experiment
 # modules of this package with `jobs`, `measure` and `page`
 EXPERIMENTS = (
     "quality", "convergence", "clock", "published", "ablation", "rate", "pairs", "previews", "maps", "labels",
-    "enlarge", "fill", "video", "batch", "many", "loading", "render", "gpu", "gpu-fit", "decode",
+    "enlarge", "objects", "fill", "video", "batch", "many", "loading", "render", "gpu", "gpu-fit", "decode",
 )  # fmt: skip
 
 

@@ -16,8 +16,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcgs import FitConfig, FitResult, fit
+from kcgs import FitConfig, FitResult, Scene, fit
 from kcgs.functional import ef_psnr, psnr
+from kcgs.rate import fit_bytes
 
 from .core.clocks import threads
 from .core.compare import Comparison, differences, group_by, losses_table, means_table, values_of
@@ -29,15 +30,21 @@ from .core.images import FRAMES, choose, load
 from .core.run import Job, Options, Page, Row
 
 GPU, CORES, OTHER = "best, GPU", "best, cores", "gaussian-image, GPU"
+FILE_GPU, FILE_CORES = "file, GPU", "file, cores"
 FIRST = {"process": "best, GPU, new process", "machine": "best, GPU, new machine"}
 # recipe, settings that differ from the recipe, device
 METHODS: dict[str, tuple[str, dict[str, Any], str]] = {
     GPU: ("best", {}, "cuda"),
     CORES: ("best", {}, "cpu"),
     OTHER: ("gaussian-image", {"iterations": 5_000}, "cuda"),
+    FILE_GPU: ("best", {"objective": "l2"}, "cuda"),
+    FILE_CORES: ("best", {"objective": "l2"}, "cpu"),
     **dict.fromkeys(FIRST.values(), ("best", {}, "cuda")),
 }
 KODAK_COUNT = 10_000
+# 0.15 bits per pixel
+FILE_BYTES = 7_372
+QUICK_FILE_BYTES = 400
 DAVIS_COUNTS = (500, 1_250, 5_000, 7_500, 10_000)
 # images and N at which the other methods are compared with `best` on a GPU
 KODAK_COMPARED = ("kodim05", "kodim15", "kodim23")
@@ -49,13 +56,18 @@ GOALS = {"Kodak": {"seconds": 0.5, "psnr": 36.5}, "DAVIS": {"seconds": 1.5}}
 # seconds that the first fit of a process may take longer than the next
 GOAL_OF_A_FIRST_FIT = 15.0
 CACHES = ("NUMBA_CACHE_DIR", "TRITON_CACHE_DIR")
-COMPARISONS = (Comparison(GPU, CORES), Comparison(GPU, OTHER))
+COMPARISONS = (Comparison(GPU, CORES), Comparison(GPU, OTHER), Comparison(FILE_GPU, FILE_CORES))
 QUANTITIES = ("images", "seconds", "next_seconds", "process_seconds", "iterations", "psnr", "ef_psnr")
 METHOD = f"""Photos of Kodak without regions, and first frames of DAVIS with the given masks. Seconds are those of the
 call of `fit`, image and mask on the device, the GPU waited for; a short fit of the same size comes before, and is not
 in them. *GPU* is a GPU, *cores* all cores beside it. `gaussian-image` has {METHODS[OTHER][1]["iterations"]:,}
 iterations, a tenth of its own. *new process* is the first fit of a process, *new machine* that with empty caches of
 compiled code; *next* is the second fit of that process, and *process seconds* begin before Python starts."""
+
+
+# where files were measured
+METHOD_OF_FILES = f"""*file* is `fit_bytes` without a mask, in {FILE_BYTES:,} bytes for PSNR; its PSNR is that of the
+decoded scene."""
 
 
 def set_of(image: str) -> str:
@@ -85,6 +97,17 @@ def timed_fit(image: Tensor, labels: Tensor | None, n: int, config: FitConfig) -
     result = fit(image, labels, n, recipe=config)
     synchronize()
     return result, time.perf_counter() - start
+
+
+def timed_file(image: Tensor, config: FitConfig, quick: bool) -> tuple[Scene, int, float]:
+    """Fit an image to a file, and return the decoded scene, the iterations of the fit and the seconds."""
+    target_bytes = QUICK_FILE_BYTES if quick else FILE_BYTES
+    short = config.model_copy(update={"iterations": min(WARM_UP_ITERATIONS, config.planned_iterations)})
+    finish(lambda: fit_bytes(image, None, target_bytes, recipe=short))
+    start = time.perf_counter()
+    _, scene, result = fit_bytes(image, None, target_bytes, recipe=config)
+    synchronize()
+    return scene, result.history[-1].iteration, time.perf_counter() - start
 
 
 def load_to(device: str, image: str, data: str, quick: bool) -> tuple[Tensor, Tensor | None]:
@@ -122,34 +145,41 @@ def measure_first_fit(*arguments: Any, new_machine: bool) -> Row:
             return {"seconds": first, "next_seconds": pool.apply(fit_in_process, arguments), "process_seconds": whole}
 
 
-def measure(image: str, n: int, method: str, device: str, data: str, quick: bool) -> list[Row]:
-    """Fit an image by one of METHODS."""
+def measure(image: str, n: int | None, method: str, device: str, data: str, quick: bool) -> list[Row]:
+    """Fit an image by one of METHODS; a file, which has no number of Gaussians, has n=None."""
     check_device(device)
-    row = {"image": image, "n": n, "method": method}
+    row: Row = {"image": image, "n": n, "method": method}
     if method in FIRST.values():
+        assert n is not None
         new_machine = method == FIRST["machine"]
         return [row | measure_first_fit(image, n, method, device, data, quick, new_machine=new_machine)]
     pixels, labels = load_to(device, image, data, quick)
     config = config_of(method, quick)
     with threads(os.cpu_count() or 1):
-        warm_up(config, n, (pixels.shape[1], pixels.shape[2]), labels is not None, device)
-        result, seconds = timed_fit(pixels, labels, n, config)
-    render = result.scene.render()
-    row |= {"seconds": seconds, "iterations": result.history[-1].iteration, "psnr": float(psnr(render, pixels))}
+        if n is None:
+            scene, iterations, seconds = timed_file(pixels, config, quick)
+        else:
+            warm_up(config, n, (pixels.shape[1], pixels.shape[2]), labels is not None, device)
+            result, seconds = timed_fit(pixels, labels, n, config)
+            scene, iterations = result.scene, result.history[-1].iteration
+    render = scene.render()
+    row |= {"seconds": seconds, "iterations": iterations, "psnr": float(psnr(render, pixels))}
     return [row | ({} if labels is None else {"ef_psnr": float(ef_psnr(render, pixels, labels))})]
 
 
 def jobs(options: Options) -> list[Job]:
     """List fits of photos of Kodak and frames of DAVIS; without data, of photos of scikit-image."""
-    plan = [(image, KODAK_COUNT, GPU) for image in choose(options, "kodak")]
+    plan: list[tuple[str, int | None, str]] = [(image, KODAK_COUNT, GPU) for image in choose(options, "kodak")]
     if options.quick:
         plan = [("disc", 30, method) for method in (GPU, CORES, OTHER, FIRST["process"])]
+        plan += [("disc", None, method) for method in (FILE_GPU, FILE_CORES)]
     elif options.data is not None:
         frames = choose(options, "davis")
         plan += [(image, n, GPU) for image in frames for n in DAVIS_COUNTS]
         plan += [(KODAK_COMPARED[0], KODAK_COUNT, FIRST["process"])]
         plan += [(image, n, CORES) for image, n in DAVIS_COMPARED]
         plan += [(image, KODAK_COUNT, method) for method in (CORES, OTHER) for image in KODAK_COMPARED]
+        plan += [(image, None, method) for method in (FILE_GPU, FILE_CORES) for image in KODAK_COMPARED]
         plan += [(KODAK_COMPARED[0], KODAK_COUNT, FIRST["machine"])]
     return [
         {"image": image, "n": n, "method": method, "device": METHODS[method][2], **options.image_arguments()}
@@ -193,9 +223,10 @@ def page(folder: Path, rows: list[Row]) -> Page:
         means_table(rows, ["set", "n", "method"], "", QUANTITIES),
         *(["Goals:", goals_table(goals)] if goals else []),
     ]
+    has_files = any(row["method"] == FILE_GPU for row in rows)
     losses = [missed_goals(goals), losses_table(fits, COMPARISONS, ["psnr", "seconds"], ["n"])]
     gains = differences(fits, COMPARISONS, ["psnr", "seconds"], ["set", "n"])
     return Page(
         "How fast does a GPU fit, and how well?", " ".join(sentences), "gpu-fit.png", "\n\n".join(tables),
-        "\n\n".join(filter(None, losses)), METHOD, gains,
+        "\n\n".join(filter(None, losses)), METHOD + (f" {METHOD_OF_FILES}" if has_files else ""), gains,
     )  # fmt: skip

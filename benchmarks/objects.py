@@ -1,31 +1,27 @@
-"""How well is an object cut out, by itself or by a box and clicks? `python -m benchmarks.objects DATA/DAVIS` says it.
-
-The box is that of the mask, larger by 5 % on each side. Each click is in the middle of the largest wrong area: the
-pixel of it that is farthest from its border.
-"""
+"""How well is an object cut out, by itself or by a box and clicks?"""
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
-from dataclasses import dataclass, field
 from itertools import product
-from statistics import fmean
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rich.progress import track
 from scipy.ndimage import distance_transform_edt, label
-from torch import Tensor
 
 from kcgs.data import Davis
 from kcgs.segment import segment_with_scores
 
-from .core.compare import markdown
+from .core.compare import group_by, means_table
+from .core.figures import Panel, save_lines
+from .core.images import load
+from .core.run import Job, Options, Page, Row
 
+# the segmenter, and whether it gets a box
+METHODS = {"grabcut, box": ("grabcut", True), "object": ("object", False), "object, box": ("object", True)}
 NUM_CLICKS = 4
 # share of the mask's sides by which a box is larger on each side
 MARGIN = 0.05
@@ -33,6 +29,10 @@ MARGIN = 0.05
 GOOD = 0.9
 # overlap below which a result is a failure
 BAD = 0.5
+METHOD = f"""First frames of DAVIS with their masks. The box is that of the mask, larger by {MARGIN:.0%} on each side.
+Each click is in the middle of the largest wrong area, on its pixel that is farthest from the border. IoU is the overlap
+with the mask, intersection over union; *good* is the share of frames with at least {GOOD}, *failed* that below {BAD}.
+`object` is the network ISNet, as kcgs downloads it."""
 
 Mask = NDArray[np.bool_]
 
@@ -65,62 +65,56 @@ def next_click(mask: Mask, truth: Mask) -> tuple[str, list[int]] | None:
     return name, [int(x), int(y)]
 
 
-@dataclass
-class Way:
-    """A method with its options, and its overlaps and seconds for each frame and number of clicks."""
-
-    method: str
-    has_box: bool
-    options: dict[str, Any] = field(default_factory=dict)
-    overlaps: list[list[float]] = field(default_factory=list)
-    seconds: list[list[float]] = field(default_factory=list)
-
-    def __str__(self) -> str:
-        return f"{self.method}, box" if self.has_box else self.method
-
-    def cut_out(self, image: Tensor, truth: Mask) -> None:
-        """Cut out the object of a frame with 0, 1, 2 ... clicks."""
-        clicks: dict[str, list[list[int]]] = {"foreground": [], "background": []}
-        prompt = {"box": box_of(truth)} if self.has_box else {}
-        self.overlaps.append([])
-        self.seconds.append([])
-        for _ in range(NUM_CLICKS + 1):
-            start = time.process_time()
-            labels, _, names = segment_with_scores(image, self.method, **self.options, **prompt, **clicks)
-            self.seconds[-1].append(time.process_time() - start)
-            ids = [region for region, name in (names or {}).items() if name == "object"]
-            mask = torch.isin(labels, torch.tensor(ids)).numpy()
-            self.overlaps[-1].append(float((mask & truth).sum() / (mask | truth).sum()))
-            if (click := next_click(mask, truth)) is not None:
-                clicks[click[0]].append(click[1])
+def measure(image: str, method: str, data: str, quick: bool) -> list[Row]:
+    """Cut out the object of a frame with 0, 1, 2 ... clicks."""
+    pixels, masks = load(image, data, quick)
+    assert masks is not None
+    truth, rows = masks.numpy() > 0, []
+    segmenter, has_box = METHODS[method]
+    prompt = {"box": box_of(truth)} if has_box else {}
+    clicks: dict[str, list[list[int]]] = {"foreground": [], "background": []}
+    for number in range(NUM_CLICKS + 1):
+        start = time.process_time()
+        labels, _, names = segment_with_scores(pixels, segmenter, **prompt, **clicks)
+        seconds = time.process_time() - start
+        ids = [region for region, name in (names or {}).items() if name == "object"]
+        mask = torch.isin(labels, torch.tensor(ids)).numpy()
+        iou = float((mask & truth).sum() / (mask | truth).sum())
+        rows.append(
+            {
+                "image": image, "method": method, "clicks": number, "iou": iou, "good": float(iou >= GOOD),
+                "failed": float(iou < BAD), "core_seconds": seconds,
+            }
+        )  # fmt: skip
+        if (click := next_click(mask, truth)) is not None:
+            clicks[click[0]].append(click[1])
+    return rows
 
 
-def main() -> None:
-    """Cut out the object of each first frame."""
-    parser = argparse.ArgumentParser("python -m benchmarks.objects", description=__doc__)
-    parser.add_argument("davis", help="folder with JPEGImages and Annotations in it")
-    parser.add_argument("--model", help="weights of the method object; not given: its own, which are downloaded")
-    parser.add_argument("--sam", help="weights of the method sam, which is left out without them")
-    options = parser.parse_args()
-    weights = {"model": options.model} if options.model else {}
-    ways = [Way("grabcut", True), Way("object", False, weights), Way("object", True, weights)]
-    if options.sam:
-        ways.append(Way("sam", True, {"model": options.sam}))
-    davis, frames = Davis(options.davis), []
-    for frame in track(davis, total=len(davis)):
-        frames.append(frame.sequence)
-        for way in ways:
-            way.cut_out(frame.image, frame.labels.numpy() > 0)
-        print(frame.sequence, "; ".join(" ".join(f"{value:.2f}" for value in way.overlaps[-1]) for way in ways))
-    rows = []
-    for way, number in product(ways, range(NUM_CLICKS + 1)):
-        values, times = ([row[number] for row in table] for table in (way.overlaps, way.seconds))
-        failures = ", ".join(name for name, value in zip(frames, values, strict=True) if value < BAD)
-        good = str(sum(value >= GOOD for value in values))
-        rows.append([str(way), str(number), f"{fmean(values):.2f}", good, failures, f"{fmean(times):.1f}"])
-    titles = ["method", "clicks", "mean IoU", f"at least {GOOD}", f"below {BAD}", "seconds of a core"]
-    print(markdown(titles, rows))
+def jobs(options: Options) -> list[Job]:
+    """List the frames by each method; in the quick form a disc by GrabCut, which takes no network."""
+    methods, images = list(METHODS), ["disc"]
+    if options.quick:
+        methods = methods[:1]
+    else:
+        images = [frame.sequence for frame in Davis(options.folder() / "DAVIS")]
+    return [
+        {"image": image, "method": method, **options.image_arguments()} for image, method in product(images, methods)
+    ]
 
 
-if __name__ == "__main__":
-    main()
+def page(folder: Path, rows: list[Row]) -> Page:
+    """Write the report."""
+    save_lines(folder / "objects.png", [Panel("", rows, "clicks", "iou", ("linear", "linear"))], "method", "clicks")
+    sentences, losses = [], []
+    for (method, number), group in group_by(rows, ["method", "clicks"]).items():
+        overlaps = {row["image"]: row["iou"] for row in group}
+        if number in (0, NUM_CLICKS):
+            sentences.append(f"`{method}` and {number} clicks: mean IoU {np.mean(list(overlaps.values())):.2f}.")
+        if failures := ", ".join(image for image, iou in overlaps.items() if iou < BAD):
+            losses.append(f"- `{method}` and {number} clicks, below {BAD}: {failures}")
+    table = means_table(rows, ["method", "clicks"], "", ("iou", "good", "failed", "core_seconds"))
+    return Page(
+        "How well is an object cut out, by itself or by a box and clicks?", " ".join(sentences), "objects.png", table,
+        "\n".join(losses), METHOD,
+    )  # fmt: skip

@@ -17,7 +17,7 @@ from kcgs.segment.images import reduce_image, rgb_to_lab, to_pixels
 from kcgs.segment.prompts import Box, Point, Prompt, window_of
 from kcgs.segment.snapping import snap_contours
 
-# Tuned by the overlap with masks of DAVIS, from boxes and from masks of ISNet: `python -m benchmarks.objects`.
+# Tuned by the overlap with masks of DAVIS, from boxes and from masks of ISNet: `python -m benchmarks objects`.
 # width of the background around the box that GrabCut sees, in sides of the box
 _MARGIN = 0.3
 # largest number of pixels at which an object is segmented; more give no better masks
