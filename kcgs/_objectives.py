@@ -20,7 +20,7 @@ PURPOSES: dict[Purpose, tuple[ObjectiveName, ...]] = {
 _RENAMED = {
     "psnr": "which is now 'l2'",
     "auto": "which is now the default: leave it out",
-    "l1+ssim": "which is now a function of benchmarks/core/image_gs.py",
+    "l1+ssim": "which is now in benchmarks/core/image_gs.py of the repository",
 }
 
 

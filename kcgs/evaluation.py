@@ -54,7 +54,10 @@ def evaluate(scene: Scene, image: Any, labels: Any = None, *, with_ssimulacra2: 
         if name == "ssimulacra2" and not with_ssimulacra2:
             continue
         if not metric.takes_labels:
-            metrics[name] = float(metric.function(render, target))
+            try:
+                metrics[name] = float(metric.function(render, target))
+            except ImportError:  # its package is missing
+                metrics[name] = math.nan
         else:
             with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # a map of one region: no contours
                 metrics[name] = math.nan if regions is None else float(metric.function(render, target, regions.labels))

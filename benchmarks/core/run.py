@@ -74,9 +74,9 @@ def run_experiment(
     """Measure the jobs without a result, then write results.csv, run.json and report.md.
 
     A job is the keyword arguments of `measure`, a function of a module, which returns rows of JSON's values. The rows
-    are kept in OUTPUT/runs, under a hash of the job, the text of `measure`, and the code of kcgs and benchmarks/core;
-    remove the folder to measure anew. An interruption leaves the results so far: `--redraw` reports them, and the same
-    command goes on.
+    are kept in OUTPUT/runs, under a hash of the job, of the text above `page` in the module, and of the code of kcgs
+    and benchmarks/core; remove the folder to measure anew. An interruption leaves the results so far: `--redraw`
+    reports them, and the same command goes on.
     """
     if not options.redraw:
         all_jobs = jobs(options)
@@ -137,7 +137,11 @@ def _number(text: str) -> float | int | str:
 
 
 def _path(folder: Path, measure: Measure, job: Job) -> Path:
-    parts = [measure.__module__, inspect.getsource(measure), job, _sources()]
+    module = inspect.getmodule(measure)
+    assert module is not None
+    # what is above `page` measures; a report may be written anew from its rows
+    text = inspect.getsource(module).partition("\ndef page(")[0]
+    parts = [measure.__module__, text, job, _sources()]
     key = hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
     return folder / f"{str(job['image']).replace('/', '-')}-{key[:20]}.json"
 

@@ -81,6 +81,7 @@ def fit_many_command(
 
     The same command again goes on where an earlier one stopped: a file that was made from the same image, mask and
     settings, and not changed since, is kept; any other file that exists is an error of that image without --overwrite.
+    With --shard, images and masks are the same if their names and sizes in bytes are.
     One image's failure stops no other; with any, the exit status is 1.
 
     The table counts images: fitted now, kept from an earlier run, failed, and missed, which are fitted or kept but do

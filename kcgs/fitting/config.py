@@ -21,7 +21,7 @@ _USUAL_ITERATIONS = 700
 _RENAMED = {
     "loss": "it is objective now, with the same values",
     "densify": "it is an argument of fit, an event of your own; None is matching pursuit, and 'largest-error' is in "
-    "benchmarks/core/image_gs.py",
+    "benchmarks/core/image_gs.py of the repository",
 }
 _RENAMED_PROPERTIES = {"num_iterations": "planned_iterations", "max_iterations": "iteration_limit"}
 # values of version 0.3
@@ -213,4 +213,4 @@ def _first(error: ValidationError) -> Exception:
 def _shown(value: object) -> str:
     """Return the text of a value for a message; a value of Image-GS is followed by its new place."""
     is_moved = isinstance(value, str) and value in _VALUES_OF_IMAGE_GS
-    return repr(value) + (", which is now in benchmarks/core/image_gs.py" if is_moved else "")
+    return repr(value) + (", which is now in benchmarks/core/image_gs.py of the repository" if is_moved else "")

@@ -172,8 +172,11 @@ def ssimulacra2(image: Tensor, target: Tensor) -> Tensor:
     per side it has fewer scales: compare only images of one size. Not differentiable; about 0.3 s for 480 x 854.
 
     Returns:
-        float64, on the CPU, 0-dim or :math:`(B)`. NaN, without a warning, where the package is missing
-        (`pip install ssimulacra2`), a side is below 8 pixels, or the channels are neither grey nor RGB.
+        float64, on the CPU, 0-dim or :math:`(B)`. NaN where a side is below 8 pixels, or the channels are neither grey
+        nor RGB.
+
+    Raises:
+        ImportError: it needs `pip install ssimulacra2`.
 
     Example:
         >>> ssimulacra2(torch.zeros(3, 7, 9), torch.zeros(3, 7, 9))
@@ -182,14 +185,13 @@ def ssimulacra2(image: Tensor, target: Tensor) -> Tensor:
     Source: Sneyers, "SSIMULACRA2", 2023.
     """
     image, target, batch_shape = _check_pair(image, target)
+    if image.shape[1] not in (1, 3) or min(image.shape[2:]) < 8:
+        return torch.full(batch_shape, math.nan, dtype=torch.float64)
     try:
         from ssimulacra2 import compute_ssimulacra2
-    except ImportError:
-        compute_ssimulacra2 = None
-    if compute_ssimulacra2 is None or image.shape[1] not in (1, 3) or min(image.shape[2:]) < 8:
-        values = [math.nan] * len(image)
-    else:
-        values = [compute_ssimulacra2(_ppm(t), _ppm(i)) for i, t in zip(image, target, strict=True)]
+    except ImportError as error:
+        raise ImportError("this metric needs the package ssimulacra2: pip install ssimulacra2") from error
+    values = [compute_ssimulacra2(_ppm(t), _ppm(i)) for i, t in zip(image, target, strict=True)]
     return torch.tensor(values, dtype=torch.float64).reshape(batch_shape)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from itertools import count
 from typing import NamedTuple
 
@@ -22,18 +22,22 @@ FLOAT = ir.DataType.FLOAT
 INT32 = ir.DataType.INT32
 INT64 = ir.DataType.INT64
 
-# dtypes of results; other operators have the dtype of their first operand, or of the second after a condition
-_RESULTS = {
-    "Equal": BOOL,
-    "Greater": BOOL,
-    "Less": BOOL,
-    "LessOrEqual": BOOL,
-    "Shape": INT64,
-    "If": FLOAT,  # its branches return images
-    "Loop": FLOAT,  # its turns return parts of an image
-}
-
 Array = NDArray[np.generic]
+
+
+@cache
+def _result_dtype(operator: str) -> int | ir.DataType:
+    """Return the dtype of an operator's result, or the index of the operand that has this dtype."""
+    if operator in ("If", "Loop"):
+        return FLOAT  # here their branches and turns return parts of an image
+    schema = onnx.defs.get_schema(operator, OPSET)
+    kind = schema.outputs[0].type_str
+    for index, operand in enumerate(schema.inputs):
+        if operand.type_str == kind:
+            return index
+    constraints = {constraint.type_param_str: constraint.allowed_type_strs for constraint in schema.type_constraints}
+    (name,) = constraints.get(kind, [kind])  # such as "tensor(bool)"
+    return ir.DataType[name.removeprefix("tensor(").removesuffix(")").upper()]
 
 
 def _arithmetic(operator: str, reflected: bool = False) -> Callable[[Value, Operand], Value]:
@@ -94,7 +98,7 @@ class Value:
         """Cast to a dtype."""
         if dtype == self.dtype:
             return self
-        return Value(self.graph, self.graph.Cast(self, to=dtype).value, dtype)
+        return self.graph.add_node("Cast", [self], [dtype], to=dtype)[0]
 
 
 # operands of an operator: lists and Python integers become int64, Python floats become float32
@@ -135,7 +139,8 @@ class Graph:
     def apply(self, operator: str, *operands: Operand, **attributes: object) -> Value:
         """Apply an operator with one result."""
         values = [self.constant(operand) for operand in operands]
-        dtype = _RESULTS.get(operator) or values[operator == "Where"].dtype
+        dtype = _result_dtype(operator)
+        dtype = dtype if isinstance(dtype, ir.DataType) else values[dtype].dtype
         return self.add_node(operator, values, [dtype], **attributes)[0]
 
     def input(self, name: str, dtype: ir.DataType, shape: Sequence[int | str], doc: str | None = None) -> Value:

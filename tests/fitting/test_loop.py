@@ -337,9 +337,12 @@ class TestErrors:
             ({"loss": "l1"}, "^unknown setting 'loss': it is objective now, with the same values$"),
             (
                 {"objective": "l1+ssim"},
-                "^objective must be .*, which is now a function of benchmarks/core/",
+                "^objective must be .*, which is now in benchmarks/core/",
             ),
-            ({"densify": "largest-error"}, "^unknown setting 'densify': it is an argument of fit, .*image_gs.py$"),
+            (
+                {"densify": "largest-error"},
+                "^unknown setting 'densify': it is an argument of fit, .*image_gs.py of ",
+            ),
             ({"initializer": "gradient"}, "^initializer must be .*; got 'gradient', which is now in benchmarks/core/"),
             ({"optimizer": "adam"}, "^optimizer must be .* or 'adan'; got 'adam', which is now in benchmarks/core/"),
             ({"optimizer": object()}, "^optimizer must be 'gaussian-adam' or 'adan'; got "),

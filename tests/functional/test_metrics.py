@@ -1,6 +1,7 @@
 """Image metrics against float64 transcriptions of their papers, pytorch-msssim, and at their limits."""
 
 import itertools
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -361,6 +362,11 @@ class TestSsimulacra2:
 
     def test_not_defined(self) -> None:
         assert all(ssimulacra2(t, t).isnan() for t in (torch.ones(3, 7, 60), torch.ones(4, 40, 60)))
+
+    def test_without_its_package(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setitem(sys.modules, "ssimulacra2", None)
+        with pytest.raises(ImportError, match="pip install ssimulacra2"):
+            ssimulacra2(torch.ones(3, 40, 60), torch.ones(3, 40, 60))
 
 
 class TestGradient:
