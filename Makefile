@@ -40,7 +40,7 @@ test-all: $(VENV)/.installed
 # that need a GPU, and the reports that have a part of it. DATA is the folder of images, as in docs/results.md.
 GPU_REPORTS := gpu gpu-fit batch many render
 gpu:
-	$(PYTHON) -m pytest -q --device all tests/kernels tests/optim tests/functional tests/fitting/test_on_device.py \
+	$(PYTHON) -m pytest -q --device all tests/test_triton.py tests/kernels tests/optim tests/functional tests/fitting/test_on_device.py \
 	  tests/fitting/test_pursuit.py tests/maps/test_tiles.py
 	for name in $(GPU_REPORTS); do $(PYTHON) -m benchmarks $$name -o gpu-reports/$$name $(if $(DATA),--data $(DATA)) || exit 1; done
 

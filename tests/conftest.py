@@ -40,7 +40,7 @@ LONGEST = (
     "onnx/test_torch_export.py",
     "benchmarks/test_quick.py",
     "engine/test_ray.py",
-    "kernels/test_cuda.py",
+    "test_triton.py",
     "cli/test_many.py",
     "kernels/test_cpu.py",
     "rate/test_budget.py",

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -133,36 +131,6 @@ class TestResume:
         assert code == 1 and "a.safetensors exists, made with other settings or changed since; --overwrite" in err
         assert json.loads(fit_many("photos/a.png", *SETTINGS, "--overwrite", "--json").out)["fitted"] == 1
         assert Path("out/a.safetensors").read_bytes() == scene
-
-    def test_killed_with_its_workers(self, fit_many: Kcgs) -> None:
-        """All processes are killed when one scene of three is done: the next call keeps it and fits the others."""
-        code = (
-            "import time\n"
-            "from kcgs.cli import main, many_jobs\n"
-            "fit_and_save = many_jobs.fit_and_save\n"
-            "def fit_or_wait(path, *arguments, **settings):\n"
-            "    if path.stem != 'a': time.sleep(600)\n"
-            "    return fit_and_save(path, *arguments, **settings)\n"
-            "many_jobs.fit_and_save = fit_or_wait\n"
-            "if __name__ == '__main__': main()\n"
-        )
-        Path("script.py").write_text(code)
-        command = [sys.executable, "script.py", "fit-many", "photos", *ALONE, "--workers", "2"]
-        scene, record = Path("out/a.safetensors"), Path("out/a.json")
-        process = subprocess.Popen(command, start_new_session=True)
-        try:
-            deadline = time.monotonic() + 120
-            while not record.exists() or b"psnr" not in record.read_bytes():
-                assert process.poll() is None and time.monotonic() < deadline
-                time.sleep(0.05)
-        finally:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
-        content, written = scene.read_bytes(), scene.stat().st_mtime_ns
-        code_again, out, err = fit_many("photos", *ALONE, "--json")
-        assert code_again == 0, err
-        assert json.loads(out)["fitted"] == 2 and list(rows()) == ["a", "b", "c"]
-        assert (scene.read_bytes(), scene.stat().st_mtime_ns) == (content, written)
 
     def test_killed_worker(self, fit_many: Kcgs) -> None:
         """A worker is killed over the second image: the next call keeps the first, which is that of this process."""

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
-import subprocess
-import sys
 from itertools import combinations
 from pathlib import Path
 
@@ -263,18 +260,6 @@ def test_a_small_region_does_not_stay_black() -> None:
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed: pip install triton")
 class TestTriton:
-    """TRITON_INTERPRET is read when triton is imported, so it must not be set in the process of the other tests."""
-
-    def test_filters_as_compiled_loops(self) -> None:
-        environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"}
-        if not torch.cuda.is_available():
-            environment |= {"TRITON_INTERPRET": "1", "OMP_NUM_THREADS": "1"}
-        file = Path(__file__).with_name("triton_filters.py")
-        command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(file)]
-        done = subprocess.run(command, env=environment, cwd=file.parents[2], capture_output=True, text=True)
-        assert done.returncode == 0, done.stdout + done.stderr
-        assert " passed" in done.stdout and " skipped" not in done.stdout, done.stdout
-
     @pytest.mark.parametrize("capability", [80, 90])
     @pytest.mark.parametrize("has_labels", [False, True])
     def test_compiles_without_a_gpu(

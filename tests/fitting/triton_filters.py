@@ -1,4 +1,4 @@
-"""Filters that test_pursuit.py runs in a process of their own: on a GPU, or with TRITON_INTERPRET=1 in numpy."""
+"""Filters that tests/test_triton.py runs in a process of their own: on a GPU, or with TRITON_INTERPRET=1 in numpy."""
 
 from __future__ import annotations
 

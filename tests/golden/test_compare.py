@@ -30,7 +30,7 @@ def test_cases_and_values_that_differ_are_named(monkeypatch, capsys) -> None:
         with (tree / "tests/golden/cases.py").open("a") as cases:
             cases.write(EDIT)
         monkeypatch.setattr(compare, "ROOT", tree)
-        assert compare.main(["HEAD", "--only", "functional/metrics", "functional/new", "segment/slic"]) == 0
+        assert compare.main(["HEAD", "--only", "functional/metrics", "functional/new", "splat/tiled-batch"]) == 0
         monkeypatch.undo()
     printed = capsys.readouterr().out.splitlines()
     assert printed == ["functional/metrics: psnr", "only in the tree: functional/new", "1 of 2 cases are the same"]

@@ -1,4 +1,4 @@
-"""Cases that test_cuda.py runs in a process of their own: on a GPU, or with TRITON_INTERPRET=1 in numpy."""
+"""Cases that tests/test_triton.py runs in a process of their own: on a GPU, or with TRITON_INTERPRET=1 in numpy."""
 
 from __future__ import annotations
 

@@ -34,11 +34,9 @@ PRINTED = {
     "09_kornia_augmentation": r"mean of sixteen: 2\d\.\d\d dB; render: 2\d\.\d\d dB",
     "10_train_on_gaussians": r"Gaussians: \d\d\.\d% of the digits in \d+ epochs",
 }
-# a kernel takes ten seconds for what it imports, and the last two half a minute in their quick form: all run before a
+# a kernel takes ten seconds for what it imports, and most take half a minute in their quick form: all run before a
 # release, by `make test-all`
-SLOW = (
-    "02_why_contours", "03_label_maps", "05_export_to_onnx", "08_video", "06_differentiable_layer", "07_compact_files"
-)  # fmt: skip
+SLOW = PRINTED.keys() - {"01_fit_a_photo", "09_kornia_augmentation"}
 BYTES = 2_700_000
 
 

@@ -1,4 +1,4 @@
-"""Steps that test_cuda.py takes in a process of its own: on a GPU, or with TRITON_INTERPRET=1 in numpy."""
+"""Steps that tests/test_triton.py takes in a process of its own: on a GPU, or with TRITON_INTERPRET=1 in numpy."""
 
 from __future__ import annotations
 
