@@ -119,8 +119,8 @@ def page(folder: Path, rows: list[Row]) -> Page:
             f"{images} on {method}: {means[many][0]:.2f} dB at N = {many:,} in {means[many][1]:.1f} seconds."
         )
         if few < many:
-            grows = means[many][1] / means[few][1] / (many / few)
-            sentences.append(f"From N = {few:,} on, the time grows by {grows:.2f} of what N grows by.")
+            factor = means[many][1] / means[few][1]
+            sentences.append(f"{many / few:.3g} times as many Gaussians as {few:,} take {factor:.2g} times as long.")
         if images == "Kodak" and method == GPU and GOAL[0] in means:
             psnr, seconds = means[GOAL[0]]
             name = f"Kodak, N = {GOAL[0]:,}"

@@ -64,11 +64,13 @@ def save_lines(path: Path, panels: Sequence[Panel], line: str, along: str, marke
                 axes.plot([bar[panel.x]] * 2, ends, color=COLORS[index % len(COLORS)], linewidth=1)
         axes.set(xlabel=title(panel.x), ylabel=title(panel.y), title=panel.title)
         axes.set(xscale=panel.scales[0], yscale=panel.scales[1])
-        axes.xaxis.set_major_formatter("{x:g}")
-        if panel.scales[0] == "log":
-            low, high = axes.get_xlim()
-            axes.xaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
-            axes.xaxis.set_minor_formatter("{x:g}" if high < 100 * low else "")
+        for axis, scale, (low, high) in zip(
+            (axes.xaxis, axes.yaxis), panel.scales, (axes.get_xlim(), axes.get_ylim()), strict=True
+        ):
+            axis.set_major_formatter("{x:g}")
+            if scale == "log":
+                axis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
+                axis.set_minor_formatter("{x:g}" if high < 100 * low else "")
     for axes in all_axes[len(panels) :]:
         axes.set_visible(False)
     labels = [str(name) for name in handles]
