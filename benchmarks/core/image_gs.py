@@ -87,7 +87,7 @@ class DensifyAtLargestError:
     def _sample(self, state: FitState, count: int) -> GaussianField:
         """Return round Gaussians of half the spacing, of the colour that their pixel lacks."""
         problem, (height, width) = state.problem, state.problem.size
-        residual = problem.canvas - state.render()
+        residual = problem.target - state.render()
         errors = residual.square().mean(1).flatten(1).double().cpu().numpy() + 1e-12
         seed = (problem.seed, state.num_additions)
         samples = np.stack([_sample_pixels(error, count, np.random.default_rng(seed)) for error in errors])

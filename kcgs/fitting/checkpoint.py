@@ -73,9 +73,9 @@ class Checkpoint:
 def _fingerprint(problem: Problem) -> str:
     # a resumed fit may get more time
     settings = problem.config.model_dump_json(exclude={"max_seconds"})
-    numbers = f"{settings} {problem.num_gaussians} {problem.seed} {tuple(problem.canvas.shape)}"
+    numbers = f"{settings} {problem.num_gaussians} {problem.seed} {tuple(problem.target.shape)}"
     digest = hashlib.sha256(numbers.encode())
-    digest.update(problem.canvas.cpu().numpy().tobytes())
+    digest.update(problem.target.cpu().numpy().tobytes())
     if problem.regions is not None:
         digest.update(repr(problem.regions.softness).encode())
         digest.update(problem.regions.labels.cpu().numpy().tobytes())

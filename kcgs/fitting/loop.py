@@ -170,13 +170,13 @@ def fit_problem(
     stepper_of: Callable[[FitState], Stepper] = make_stepper,
 ) -> FitResult:
     """Fit a checked problem, up to the share `until` of its schedule: see `fit`."""
-    canvas = problem.canvas
+    target = problem.target
     if problem.config.max_seconds is not None:
-        precompile(problem.config, canvas.device)
-    warm_up(problem.config.backend, canvas.device, canvas.dtype, canvas.shape[1])
+        precompile(problem.config, target.device)
+    warm_up(problem.config.backend, target.device, target.dtype, target.shape[1])
     _warn_of_regions(problem)
     searches = problem.config.target_psnr is not None
-    with Progress("fit", pulse=searches, visible=progress) as bar, threads_for_kernels(canvas[0, 0].numel()):
+    with Progress("fit", pulse=searches, visible=progress) as bar, threads_for_kernels(target[0, 0].numel()):
         run_from = partial(_run, stepper_of=stepper_of, bar=bar, on_step=on_step)
         if searches:
             return search(problem, lambda state: run_from(state, Clock()))

@@ -21,7 +21,7 @@ from .checks import check_images_and_regions, check_num_gaussians, is_batch, reg
 from .config import FitConfig
 from .user_objects import NO_OBJECTS, UserObjects
 
-# value of the canvas where there is no image
+# value of the target where there is no image
 _GREY = 0.5
 # measured peak memory of a fit: bytes per pixel, per value of an image, and per Gaussian
 _PIXEL_BYTES = 50
@@ -35,7 +35,7 @@ _SATURATED_SHARE = 0.25
 class Problem:
     """The checked arguments of a fit; nothing here changes during a fit."""
 
-    canvas: Tensor
+    target: Tensor
     """The images, (B, C, H, W), in [0, 1]; without images, grey of the size of the render."""
     regions: RegionMap | None
     """The user's map; several images have a map each."""
@@ -55,22 +55,22 @@ class Problem:
     @property
     def image(self) -> Tensor | None:
         """The images, (B, C, H, W); None if there are none."""
-        return self.canvas if self.has_image else None
+        return self.target if self.has_image else None
 
     @property
     def num_images(self) -> int:
         """The number of images, B."""
-        return len(self.canvas)
+        return len(self.target)
 
     @property
     def size(self) -> tuple[int, int]:
         """(height, width) of the render."""
-        return self.canvas.shape[-2], self.canvas.shape[-1]
+        return self.target.shape[-2], self.target.shape[-1]
 
     @property
     def device(self) -> torch.device:
         """The device of the fit."""
-        return self.canvas.device
+        return self.target.device
 
     @cached_property
     def bounds(self) -> tuple[Tensor, Tensor] | None:
@@ -80,13 +80,13 @@ class Problem:
         and at 1 only where it is 1.
         """
         if self.config.clamp == "auto":
-            black, white = self.canvas == 0.0, self.canvas == 1.0
+            black, white = self.target == 0.0, self.target == 1.0
             is_saturated = (black | white).float().mean((1, 2, 3), keepdim=True) >= _SATURATED_SHARE
             if not bool(is_saturated.any()):
                 return None
             low = torch.where(black & is_saturated, 0.0, -torch.inf)
             return low, torch.where(white & is_saturated, 1.0, torch.inf)
-        return (self.canvas.new_zeros(()), self.canvas.new_ones(())) if self.config.clamp else None
+        return (self.target.new_zeros(()), self.target.new_ones(())) if self.config.clamp else None
 
     @cached_property
     def band(self) -> Tensor:
@@ -118,7 +118,7 @@ class Problem:
         """The objective that the descent lowers."""
         if self.objects.objective is not None:
             return LossObjective(self.objects.objective, self.image)
-        return self.make_objective(self.canvas)
+        return self.make_objective(self.target)
 
     def make_objective(self, image: Tensor) -> ImageObjective:
         """Return the objective of the settings for an image, (..., C, H, W)."""
@@ -153,17 +153,17 @@ def make_problem(
         # moving contours, merging regions and choosing softness need an image
         update = {"move_contours": False, "merge_regions": False}
         config = config.model_copy(update=update | ({"softness": 0.0} if config.softness == "auto" else {}))
-        canvas = torch.full((1, check_count("channels", channels), *check_size("size", size)), _GREY)
-        region_map = regions_of(canvas.shape[2:], regions)
-        canvas = canvas if region_map is None else canvas.to(region_map.ids.device)
+        target = torch.full((1, check_count("channels", channels), *check_size("size", size)), _GREY)
+        region_map = regions_of(target.shape[2:], regions)
+        target = target if region_map is None else target.to(region_map.ids.device)
     elif image is None and size is not None:
         raise InvalidArgument("image", "given, unless objective is a loss of your own", None)
     elif size is not None:
         raise InvalidArgument("size", "None with an image", size)
     else:
-        canvas, region_map = check_images_and_regions(image, regions, keep_batch=purpose == "fit")
-    count, seed = check_num_gaussians(num_gaussians, canvas), check_count("seed", seed, 0, 2**63 - 1)
-    problem = Problem(canvas, region_map, count, config, seed, objects, has_image, is_batch(image) and purpose == "fit")
+        target, region_map = check_images_and_regions(image, regions, keep_batch=purpose == "fit")
+    count, seed = check_num_gaussians(num_gaussians, target), check_count("seed", seed, 0, 2**63 - 1)
+    problem = Problem(target, region_map, count, config, seed, objects, has_image, is_batch(image) and purpose == "fit")
     if problem.num_images > 1:
         _check_batch(problem)
     return problem
@@ -171,7 +171,7 @@ def make_problem(
 
 def _check_batch(problem: Problem) -> None:
     """Refuse settings that take one image at a time, and batches that do not fit into memory."""
-    count, channels, height, width = problem.canvas.shape
+    count, channels, height, width = problem.target.shape
     for name, expected, value in (
         ("target_psnr", "None", problem.config.target_psnr),
         ("objective", "a name", problem.objects.objective),
@@ -179,4 +179,4 @@ def _check_batch(problem: Problem) -> None:
         if value is not None:
             raise InvalidArgument(name, f"{expected} with {count} images: fit them one by one", repr(value))
     pixels = height * width * (_PIXEL_BYTES + channels * _CHANNEL_BYTES)
-    check_batch_memory("image", problem.canvas, pixels + problem.num_gaussians * _GAUSSIAN_BYTES)
+    check_batch_memory("image", problem.target, pixels + problem.num_gaussians * _GAUSSIAN_BYTES)

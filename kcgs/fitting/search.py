@@ -53,7 +53,7 @@ def search(problem: Problem, run: Run) -> FitResult:
     clock, target = Clock(), problem.config.target_psnr
     assert target is not None
     trials: list[_Trial] = []
-    count: int | None = min(problem.num_gaussians, max(1, problem.canvas[0, 0].numel() // _FIRST_SPACING))
+    count: int | None = min(problem.num_gaussians, max(1, problem.target[0, 0].numel() // _FIRST_SPACING))
     while count is not None:
         budget = (problem.config.max_seconds or math.inf) - clock.seconds()
         trials.append(_fit(problem, count, trials, budget, run))
@@ -81,8 +81,8 @@ def _fit(problem: Problem, count: int, trials: list[_Trial], seconds: float, run
     goes_on = nearest is not None and _can_go_on(problem, nearest)
     state = _warm_start(problem, nearest.state) if nearest is not None and goes_on else start(problem)
     result = run(state)
-    rendered = result.scene.render().to(problem.canvas).view_as(problem.canvas)
-    return _Trial(count, float(psnr(rendered, problem.canvas)), result, state)
+    rendered = result.scene.render().to(problem.target).view_as(problem.target)
+    return _Trial(count, float(psnr(rendered, problem.target)), result, state)
 
 
 def _can_go_on(problem: Problem, trial: _Trial) -> bool:

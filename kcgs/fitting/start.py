@@ -41,7 +41,7 @@ def start(problem: Problem) -> FitState:
 def _initial_field(problem: Problem, regions: RegionMap | None, counts: list[int]) -> GaussianField:
     """Return `counts` Gaussians of the images, padded at the end with rows of the colour 0."""
     initialize = problem.objects.initializer or _INITIALIZERS[problem.config.initializer]
-    images, most = problem.canvas, max(counts)
+    images, most = problem.target, max(counts)
 
     def scatter(images: Tensor, count: int, regions: RegionMap | None) -> GaussianField:
         return check_initial(initialize(images, count, regions, problem.seed), images, count, regions)
@@ -78,7 +78,7 @@ def _regions_to_render(problem: Problem) -> RegionMap | None:
     if problem.regions is None or not problem.config.guidance:
         return None
     maps = map_of_each(problem.regions, problem.num_images)
-    maps = [_map_to_render(image, one, problem) for image, one in zip(problem.canvas, maps, strict=True)]
+    maps = [_map_to_render(image, one, problem) for image, one in zip(problem.target, maps, strict=True)]
     return None if all(one.num_regions == 1 for one in maps) else join_maps(maps)
 
 

@@ -166,7 +166,7 @@ def _best_softness(error: list[float], tie: float, levels: Sequence[float]) -> f
 
 def _measure(image: Tensor, labels: Tensor, levels: Sequence[float]) -> tuple[_Windows, _Errors]:
     """Check image and labels, place the windows, and return each window's errors at each softness, ascending."""
-    image, labels = check_problem(image, labels)
+    image, labels = check_image_and_labels(image, labels)
     windows = _place_windows(labels)
     half, halo = max(_HALF, math.ceil(2 * levels[-1])), math.ceil(RADIUS_SIGMAS * levels[-1])
     side, span = 2 * half + 1, 2 * (half + halo) + 1
@@ -183,7 +183,7 @@ def _measure(image: Tensor, labels: Tensor, levels: Sequence[float]) -> tuple[_W
     return windows, _Errors(*map(torch.cat, zip(*parts, strict=True)))
 
 
-def check_problem(image: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
+def check_image_and_labels(image: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
     """Return an image (C, H, W), and a label map of its size on the CPU.
 
     Windows are summed on the image's device: on a GPU in float64, whose products no setting of torch makes less exact.

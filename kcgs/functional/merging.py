@@ -8,7 +8,7 @@ from torch import Tensor
 from kcgs._check import check_number
 from kcgs._labels import check_labels
 
-from .contour_fit import check_problem, contour_gain
+from .contour_fit import check_image_and_labels, contour_gain
 
 # squared error, mean over channels, that a pixel of contour must save: what Gaussians would save with its bits
 MERGE_COST = 0.003
@@ -49,7 +49,7 @@ def merge_regions(
     """
     check_number("merge_cost", merge_cost, 0.0)
     labels = check_labels("labels", labels)
-    check_problem(image, labels)
+    check_image_and_labels(image, labels)
     ids, labels = torch.unique(labels, return_inverse=True)
     owners = torch.zeros_like(ids)
     if objects is not None:

@@ -35,7 +35,7 @@ def step_groups(state: dict[Tensor, Any], geometry: dict[str, Any], colors: dict
     """Move the Gaussians of one field by the state of the optimizer and the field's two groups."""
     groups = [group for group in (geometry, colors) if _has_gradient(group)]
     for group in groups:
-        begin(state[group["params"][0]], group)
+        init_state(state[group["params"][0]], group)
     parameters = geometry["params"] + colors["params"]
     if takes_triton(*parameters):
         _launch(state, geometry, colors)
@@ -173,7 +173,7 @@ def _gradient(parameter: Tensor) -> Tensor:
     return torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
 
 
-def begin(state: dict[str, Tensor], group: dict[str, Any]) -> None:
+def init_state(state: dict[str, Tensor], group: dict[str, Any]) -> None:
     """Make the averages of a group (..., N, K), if there are none; each row has an age of its own."""
     if not state:
         first, *others = group["params"]

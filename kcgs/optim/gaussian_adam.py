@@ -15,7 +15,7 @@ from kcgs._check import check_number
 from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.nn import GaussianField
 
-from .adam import COLOR_RANGE, FROZEN, begin, bounds_of, check_gradients, step_groups, within_bounds
+from .adam import COLOR_RANGE, FROZEN, bounds_of, check_gradients, init_state, step_groups, within_bounds
 from .run import cosine_decay
 
 # step of centres, in standard deviations, and of log scales; step of colours: tuned on photos, good on all images
@@ -217,7 +217,7 @@ class GaussianAdam(Optimizer):
         colors = next(group for group in self.param_groups if group["params"][0] is field.colors)
         for group in (geometry, colors):
             state = self.state[group["params"][0]]
-            begin(state, group)
+            init_state(state, group)
             state["age"].masked_fill_(mask[..., None], FROZEN)
 
     def frozen_rows(self, field: GaussianField) -> Tensor:

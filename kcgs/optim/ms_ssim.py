@@ -15,7 +15,7 @@ from .gaussians import Gaussians
 from .objectives import ImageObjective, Residual
 
 if TYPE_CHECKING:
-    from .similarity import Passes
+    from .similarity import CompiledMsSsim
 
 # weight of the squared error, and its weight on a reduced photo: it has few Gaussians, and MS-SSIM likes stray strokes
 _SQUARED = 0.003
@@ -84,14 +84,14 @@ class MsSsim(ImageObjective):
             _, inside, mean, _, weight = self._scales[-1]
             bright = _blur(inside * weight / self._norm_of(mean) / (2.0 * mean * mean + K1**2)).mean(-3)
             self._bands.append((level, blocks + window, math.inf, bright))
-        self._passes: Passes | None = None
+        self._compiled: CompiledMsSsim | None = None
         if self._scales and image.device.type == "cpu" and image.dtype == torch.float32:
-            from .similarity import Passes  # loads numba
+            from .similarity import CompiledMsSsim  # loads numba
 
             factors = [weight / self._norm * 0.25**level for level, (*_, weight) in enumerate(self._scales, 1)]
             scales = [[plane.reshape(-1, *plane.shape[-2:]).numpy() for plane in planes] for *planes, _ in self._scales]
             table = torch.stack(factors).reshape(len(factors), -1).numpy()
-            self._passes = Passes(scales, table, _MIN_SCORE)  # the compiled form of `_measure`
+            self._compiled = CompiledMsSsim(scales, table, _MIN_SCORE)  # the compiled form of `_measure`
 
     def _norm_of(self, planes: Tensor) -> Tensor:
         """Return Z of each image, in the shape and precision of planes."""
@@ -106,20 +106,20 @@ class MsSsim(ImageObjective):
         return self._slope(render.sub_(self.image))
 
     def _slope(self, difference: Tensor) -> Tensor:
-        if self._passes is None:
+        if self._compiled is None:
             return self._measure(difference)[1]
         gradient = difference.contiguous()
-        self._passes.differentiate(gradient.view(-1, *gradient.shape[-2:]).numpy(), self._squared)
+        self._compiled.differentiate(gradient.view(-1, *gradient.shape[-2:]).numpy(), self._squared)
         return gradient
 
     def value(self, render: Tensor) -> Tensor:
         """Return E of a render, clipped to [0, 1], as a mean over pixels and channels, () or (B,) float64."""
         difference = render.clamp(0.0, 1.0) - self.image
-        if self._passes is None:
+        if self._compiled is None:
             total = self._measure(difference)[0].double()
         else:
             planes = difference.contiguous().view(-1, *difference.shape[-2:])
-            total = torch.from_numpy(self._passes.value(planes.numpy())).view(difference.shape[:-3])
+            total = torch.from_numpy(self._compiled.value(planes.numpy())).view(difference.shape[:-3])
         squared = difference.square().mean((-3, -2, -1)).double()
         return total / difference.shape[-2:].numel() + self._squared * squared
 

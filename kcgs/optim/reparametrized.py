@@ -88,7 +88,7 @@ class ReparametrizedOptimizer(ABC):
         torch.autograd.backward(self._gaussians, gradients)
         self.optimizer.step()
         self.optimizer.zero_grad()
-        self._show()
+        self._write_to_field()
 
     def zero_grad(self) -> None:
         """Forget the gradients of the field."""
@@ -145,9 +145,9 @@ class ReparametrizedOptimizer(ABC):
             gaussians = self.decode()
         for name, value in zip(("means", "cholesky", "colors"), gaussians, strict=True):
             setattr(self.field, name, nn.Parameter(value.detach()))
-        self._show()
+        self._write_to_field()
 
-    def _show(self) -> None:
+    def _write_to_field(self) -> None:
         """Write the Gaussians into the field."""
         with torch.enable_grad():
             self._gaussians = self.decode()

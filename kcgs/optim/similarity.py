@@ -20,7 +20,7 @@ from .similarity_loops import CHANNEL, HALVE, HEIGHT, MARGIN, PADDING, SCALE, SC
 _ROWS = 64
 
 
-class Passes:
+class CompiledMsSsim:
     """The objective and its gradient at differences from an image, or from each of a batch.
 
     Args:

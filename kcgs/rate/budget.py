@@ -192,15 +192,15 @@ def fit_bytes(
         raise InvalidArgument("target_psnr", "None with target_bytes", config.target_psnr)
     check_count("target_bytes", target_bytes, _MIN_BYTES)
     problem = make_problem(image, regions, 1, config, seed, purpose="file of a size")
-    with Progress("trial fits", pulse=True, visible=progress), threads_for_kernels(problem.canvas[0, 0].numel()):
+    with Progress("trial fits", pulse=True, visible=progress), threads_for_kernels(problem.target[0, 0].numel()):
         choice = _choose_regions(problem, target_bytes)
     reduced = _reduce(problem, choice)
     share = _SETTINGS.fit_share if choice.regions is None else _SETTINGS.fit_share_with_regions
     result = _fit_share(share, reduced, on_step, progress)
     scene = _enlarge(result.scene, problem.size)
     report = None if problem.regions is None else report_regions(problem.regions, scene, **choice.changes)
-    with Progress("writing the file", pulse=True, visible=progress), threads_for_kernels(reduced.canvas[0, 0].numel()):
-        objective = reduced.make_objective(reduced.canvas[0].to("cpu", torch.float32))
+    with Progress("writing the file", pulse=True, visible=progress), threads_for_kernels(reduced.target[0, 0].numel()):
+        objective = reduced.make_objective(reduced.target[0].to("cpu", torch.float32))
         min_sigma = _min_sigma(problem, choice.num_gaussians)
         iterations = _shorten(_budget(problem.config).compress_iterations, reduced.reduction)
         compressor = Compressor(SceneWriter(scene), objective, iterations, seed, min_sigma)
@@ -223,7 +223,7 @@ def _reduce(problem: Problem, choice: _RegionChoice) -> Problem:
         update["iterations"] = _shorten(budget.fit_iterations, reduction)
     config = config.model_copy(update=update)
     return replace(
-        problem, canvas=area_mean(problem.canvas, (-(-height // reduction), -(-width // reduction))),
+        problem, target=area_mean(problem.target, (-(-height // reduction), -(-width // reduction))),
         regions=choice.regions, num_gaussians=choice.num_gaussians, config=config, reduction=reduction,
     )  # fmt: skip
 
@@ -254,7 +254,7 @@ def _enlarge(scene: Scene, size: tuple[int, int]) -> Scene:
 
 def _choose_regions(problem: Problem, target_bytes: int) -> _RegionChoice:
     """Merge regions whose contours save too little for their bytes; drop the map if it saves too little as a whole."""
-    image, regions, config = problem.canvas[0], problem.regions, problem.config
+    image, regions, config = problem.target[0], problem.regions, problem.config
     num_gaussians = partial(_budget(config).num_gaussians, pixels=image.shape[1] * image.shape[2])
     choice = _RegionChoice(None, num_gaussians(target_bytes), config.contour_cost, {})
     if not config.guidance:

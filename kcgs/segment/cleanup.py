@@ -77,7 +77,7 @@ class Cleanup:
         if not isinstance(self.connected, bool):
             raise TypeError(f"connected must be True or False; got {self.connected!r}")
 
-    def smallest(self, num_pixels: int) -> int:
+    def min_pixels(self, num_pixels: int) -> int:
         """Return the least number of pixels of a region, for an image of `num_pixels`."""
         return self.min_size or max(round(_MIN_SHARE * num_pixels), round(math.sqrt(num_pixels)))
 
@@ -116,7 +116,7 @@ class Cleanup:
     def _clean(self, image: Tensor, regions: Labels) -> Labels:
         if self.snap:
             regions = snap_contours(rgb_to_lab(image), regions, self.snap)
-        regions = merge_small(regions, self.smallest(regions.size))
+        regions = merge_small(regions, self.min_pixels(regions.size))
         # connect after merging: a merged piece can join the two pieces of a region on its sides
         regions = order_by_area(connect(regions) if self.connected else regions)
         if self.max_regions is not None and regions.max() >= self.max_regions:

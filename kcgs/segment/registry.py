@@ -80,7 +80,7 @@ def segment_with_scores(image: Any, method: str = "auto", **options: Any) -> Seg
     function, cleanup = _methods[method]
     cleanup = replace(cleanup, **{name: options.pop(name) for name in asdict(cleanup) if name in options})
     pixels = check_segment_image(image)
-    cleanup = replace(cleanup, min_size=cleanup.smallest(pixels[0].numel()))
+    cleanup = replace(cleanup, min_size=cleanup.min_pixels(pixels[0].numel()))
     shared = {key: value for key, value in asdict(cleanup).items() if key in inspect.signature(function).parameters}
     return cleanup.apply(pixels, function(pixels, **options, **shared))
 

@@ -283,7 +283,7 @@ def test_contours_move_on_a_device_with_few_waits_and_sums_of_one_order(monkeypa
 
     monkeypatch.setattr(contours, "move_contours", move_contours)
     # the windows of widths are summed on a GPU
-    monkeypatch.setattr(contour_fit, "check_problem", lambda image, labels: (image.double(), labels.cpu()))
+    monkeypatch.setattr(contour_fit, "check_image_and_labels", lambda image, labels: (image.double(), labels.cpu()))
     labels = (torch.arange(40) > 17).long().expand(32, 40).clone()
     labels[20:, 25:] = 5
     painted = (image() + 0.3 * (labels == 1) - 0.2 * (labels == 5)).clamp(0.0, 1.0)

@@ -74,7 +74,7 @@ class TestChooseSoftness:
         """It sums windows in float64."""
         image, labels = paint(ellipse(), 1.0) + grain(0.02), ellipse()
         expected = choose_softness(image, labels)
-        monkeypatch.setattr(contour_fit, "check_problem", lambda image, labels: (image.double(), labels))
+        monkeypatch.setattr(contour_fit, "check_image_and_labels", lambda image, labels: (image.double(), labels))
         assert choose_softness(image, labels) == expected
 
     def test_pairs(self) -> None:

@@ -55,7 +55,7 @@ def _replace_maps(state: FitState, replace: Callable[[FitState, int, RegionMap],
 def _choose_softness(state: FitState, image: int, regions: RegionMap) -> RegionMap:
     """Choose the softness of contours again, if the settings ask for it."""
     problem = state.problem
-    return with_chosen_softness(problem.canvas[image], regions) if problem.chooses_softness(image) else regions
+    return with_chosen_softness(problem.target[image], regions) if problem.chooses_softness(image) else regions
 
 
 def _move_contours(state: FitState, max_rise: float) -> None:
@@ -79,7 +79,7 @@ def _has_time(state: FitState) -> bool:
     max_seconds, seconds = state.problem.config.max_seconds, state.contour_seconds
     if max_seconds is None:
         return True
-    next_seconds = seconds[-1] if seconds else _SECONDS_PER_PIXEL * state.problem.canvas[:, 0].numel()
+    next_seconds = seconds[-1] if seconds else _SECONDS_PER_PIXEL * state.problem.target[:, 0].numel()
     return sum(seconds) + next_seconds <= _CLOCK_SHARE * state.progress * max_seconds
 
 
