@@ -37,9 +37,13 @@ test-all: $(VENV)/.installed
 	$(PYTEST)
 
 # On a machine with a GPU, in an environment of your own that has torch for it, since this project's has a CPU's: the tests
-# that need a GPU, and the reports that have a part of it. DATA is the folder of images, as in docs/results.md.
-GPU_REPORTS := gpu gpu-fit batch many render
+# that need a GPU, a profile of the first fit of a process, and the reports that have a part of it. DATA is the folder of
+# images, as in docs/results.md.
+GPU_REPORTS := gpu gpu-fit batch render many
 gpu:
+	mkdir -p gpu-reports
+	$(if $(DATA),for run in cold warm; do $(PYTHON) -m cProfile -s cumtime -m kcgs fit $(DATA)/kodak/kodim05.png --overwrite \
+	  --device cuda --regions none -o gpu-reports/scene.safetensors > gpu-reports/first-fit-$$run.txt || exit 1; done)
 	$(PYTHON) -m pytest -q --device all tests/test_triton.py tests/kernels tests/optim tests/functional tests/fitting/test_on_device.py \
 	  tests/fitting/test_pursuit.py tests/maps/test_tiles.py
 	for name in $(GPU_REPORTS); do $(PYTHON) -m benchmarks $$name -o gpu-reports/$$name $(if $(DATA),--data $(DATA)) || exit 1; done
