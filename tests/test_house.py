@@ -10,8 +10,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
 
-import pytest
-
 import kcgs
 
 PACKAGE = Path(kcgs.__file__).resolve().parent
@@ -41,17 +39,6 @@ LAYERS = [
 ]
 # modules beside the `__init__` of a room that other rooms import, two of a room at most: they load numba or Triton
 DOORS = {"kcgs.compiled.program", "kcgs.compiled.tasks", "kcgs.kernels.cuda.triton_function"}
-# what to say: what not to
-REPLACED = {
-    "image, render": r"\bpictures?\b|\bdraw(s|n|ing|ings)?\b",
-    "merge cost": r"\bworth(less)?\b",
-    "tile, mask, membership, wavefront": r"\b(strips?|lanes?|waves?)\b",
-    "Levenberg-Marquardt refinement": r"\bpolish\w*\b",
-    "quantization parameter": r"\bnoise codes?\b",
-    "per": r"\b(bits?|labels?|floats?|bytes|Gaussians?|integer) an? (pixel|Gaussian|image|file|core|thread)\b",
-}
-# names of libraries, an input inside decoders whose bytes stay, and English
-ALLOWED = re.compile(r"skimage\.draw|ImageDraw(\.Draw)?|Gaussians a file may|\.strip\(")
 
 
 class Import(NamedTuple):
@@ -162,14 +149,3 @@ def test_benchmarks_use_public_names() -> None:
             if package.startswith("kcgs."):
                 assert public in import_module(package).__all__, f"{path.name} imports {package}.{public}"
     assert not [m for m in MODULES if any(entry.module.split(".")[0] == "benchmarks" for entry in imports_of(m))]
-
-
-@pytest.mark.parametrize("term", REPLACED)
-def test_one_thing_has_one_name(term: str) -> None:
-    lines = [
-        f"{path.relative_to(ROOT)}:{number}: {line.strip()}"
-        for path in (*MODULES.values(), ROOT / "README.md", *ROOT.glob("docs/*.md"), *ROOT.glob("export/*.py"))
-        for number, line in enumerate(path.read_text().splitlines(), 1)
-        if re.search(REPLACED[term], ALLOWED.sub("", line), re.IGNORECASE)
-    ]
-    assert not lines, f"say {term}:\n" + "\n".join(lines)
