@@ -1,4 +1,4 @@
-"""The shape of the code: layers, no circles, privacy, and words that have been replaced."""
+"""The shape of the code: layers, no circles, privacy."""
 
 from __future__ import annotations
 
