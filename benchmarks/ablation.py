@@ -74,4 +74,4 @@ def page(folder: Path, rows: list[Row]) -> Page:
     )
     table = means_table(lines, ["method"], "case", QUANTITIES, "+")
     ahead = losses_table(rows_of_parts, [Comparison("best", part.first) for part in PARTS], QUANTITIES, ["n"])
-    return Page("What does each part of `best` gain?", answer, "ablation.png", table, ahead, METHOD, [*at_n, *at_bits])
+    return Page(answer, "ablation.png", table, ahead, METHOD, [*at_n, *at_bits])

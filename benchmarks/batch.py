@@ -175,6 +175,6 @@ def page(folder: Path, rows: list[Row]) -> Page:
     has_gpu = any(row["method"] == GPU for row in rows)
     missing = "" if has_gpu else "No GPU was measured: that takes a CUDA device."
     return Page(
-        "How much faster are images fitted as a batch than one by one?", " ".join(sentences), "batch.png",
+        " ".join(sentences), "batch.png",
         "\n\n".join(tables), "\n\n".join(filter(None, [missed_goals(goals), missing])), METHOD,
     )  # fmt: skip

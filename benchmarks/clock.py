@@ -1,4 +1,4 @@
-"""How good is a fit of a large photo that a clock ends, with regions and without?"""
+"""What do regions give where a clock ends the fit of a large photo?"""
 
 from __future__ import annotations
 
@@ -69,5 +69,4 @@ def page(folder: Path, rows: list[Row]) -> Page:
     answer = f"With a clock, regions change the PSNR of large photos by {', '.join(gains)}."
     table = means_table(rows, ["method"], "megapixels", ("psnr", "ef_psnr", "iterations", "seconds"))
     losses = losses_table(rows, [COMPARISON], ("psnr", "ef_psnr"), ["megapixels"])
-    question = "What do regions give where a clock ends the fit of a large photo?"
-    return Page(question, answer, "clock.png", table, losses, METHOD)
+    return Page(answer, "clock.png", table, losses, METHOD)

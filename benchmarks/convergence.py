@@ -85,6 +85,4 @@ def page(folder: Path, rows: list[Row]) -> Page:
     table = means_table(rows, ["method"], "budget", QUANTITIES)
     losses = losses_table(rows, COMPARISONS, QUANTITIES, CASES)
     gains = differences(rows, COMPARISONS, QUANTITIES, CASES)
-    return Page(
-        "How small is the error after so many seconds?", answer, "convergence.png", table, losses, method, gains
-    )
+    return Page(answer, "convergence.png", table, losses, method, gains)

@@ -1,4 +1,4 @@
-"""How fast and how exactly is a scene rendered by its decoders?"""
+"""How fast and how exactly do decoders render?"""
 
 from __future__ import annotations
 
@@ -141,4 +141,4 @@ def page(folder: Path, rows: list[Row]) -> Page:
         if slower
         else ""
     )
-    return Page("How fast and how exactly do decoders render?", answer, "decode.png", table, losses, METHOD)
+    return Page(answer, "decode.png", table, losses, METHOD)

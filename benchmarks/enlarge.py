@@ -1,4 +1,4 @@
-"""How good are scenes of small photos that are rendered large, beside enlarged pixels?"""
+"""How good are scenes of small photos that are rendered large?"""
 
 from __future__ import annotations
 
@@ -103,5 +103,4 @@ def page(folder: Path, rows: list[Row]) -> Page:
     table = means_table(rows, ["group", "factor", "method"], "pixels per Gaussian", QUANTITIES)
     losses = losses_table(rows, COMPARISONS, QUANTITIES, cases)
     gains = differences(rows, COMPARISONS, QUANTITIES, cases)
-    question = "How good are scenes of small photos that are rendered large?"
-    return Page(question, answer, "enlarge.png", table, losses, METHOD, gains)
+    return Page(answer, "enlarge.png", table, losses, METHOD, gains)

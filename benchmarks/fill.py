@@ -108,6 +108,5 @@ def page(folder: Path, rows: list[Row]) -> Page:
     )
     columns = ("pixels", *QUANTITIES, "steepest", "core_seconds", "added")
     table = means_table(rows, ["edit", "method"], "", columns)
-    question = "How well are the holes filled that deleted and moved objects leave?"
     losses = losses_table(rows, [COMPARISON], QUANTITIES, ["edit"])
-    return Page(question, answer, "fill.jpg", table, losses, METHOD)
+    return Page(answer, "fill.jpg", table, losses, METHOD)

@@ -173,8 +173,7 @@ def page(folder: Path, rows: list[Row]) -> Page:
         *_ratios(timed),
         *_exactness([row for row in swept if row["method"] == "cuda"]),
     ]
-    question = "How fast and how exactly does a GPU render?"
-    return Page(question, " ".join(sentences), "gpu.png", "\n\n".join(tables), missed_goals(goals), METHOD)
+    return Page(" ".join(sentences), "gpu.png", "\n\n".join(tables), missed_goals(goals), METHOD)
 
 
 def _speed(rows: list[Row]) -> Iterator[str]:

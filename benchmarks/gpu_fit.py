@@ -227,6 +227,6 @@ def page(folder: Path, rows: list[Row]) -> Page:
     losses = [missed_goals(goals), losses_table(fits, COMPARISONS, ["psnr", "seconds"], ["n"])]
     gains = differences(fits, COMPARISONS, ["psnr", "seconds"], ["set", "n"])
     return Page(
-        "How fast does a GPU fit, and how well?", " ".join(sentences), "gpu-fit.png", "\n\n".join(tables),
+        " ".join(sentences), "gpu-fit.png", "\n\n".join(tables),
         "\n\n".join(filter(None, losses)), METHOD + (f" {METHOD_OF_FILES}" if has_files else ""), gains,
     )  # fmt: skip

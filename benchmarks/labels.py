@@ -162,9 +162,7 @@ def page(folder: Path, rows: list[Row]) -> Page:
         f"others {min(others):.0f} to {max(others):.0f}."
     )
     table = means_table(rows, ["group", "method"], "", ("bytes", "bytes to WebP, %", "encode_speed", "decode_speed"))
-    question = "How small are label maps as files, beside other lossless codecs?"
     return Page(
-        question,
         answer,
         "labels.png",
         table,

@@ -129,6 +129,6 @@ def page(folder: Path, rows: list[Row]) -> Page:
     )
     table = means_table(rows, ["image", "n", "method"], "", ("images_per_second", "times JPEG", "bytes"))
     return Page(
-        "How fast do scenes come from a data set, beside images from files?", answer, "loading.png",
+        answer, "loading.png",
         f"{table}\n\nGoals:\n\n{goals_table(goals)}", missed_goals(goals), METHOD,
     )  # fmt: skip

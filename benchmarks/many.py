@@ -1,4 +1,4 @@
-"""What do tens of thousands of Gaussians give, and how does the time of a fit grow with them?"""
+"""What do tens of thousands of Gaussians give?"""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def page(folder: Path, rows: list[Row]) -> Page:
     table = means_table(rows, ["set", "method"], "n", ("psnr", "seconds", "peak_MB"))
     missing = "" if any(row["method"] == GPU for row in rows) else "No GPU was measured: that takes a CUDA device."
     return Page(
-        "What do tens of thousands of Gaussians give?", " ".join(sentences), "many.png",
+        " ".join(sentences), "many.png",
         "\n\n".join([table, *(["Goals:", goals_table(goals)] if goals else [])]),
         "\n\n".join(filter(None, [missed_goals(goals), missing])), METHOD,
     )  # fmt: skip

@@ -72,5 +72,4 @@ def page(folder: Path, rows: list[Row]) -> Page:
     table = means_table([*paired, *lines], ["method"], "n", QUANTITIES)
     losses = losses_table(paired, [SAME_N], QUANTITIES, ["n"])
     losses_at_bits = losses_table(equal, [EQUAL_BITS], DECODED, ["n"])
-    question = "What do automatic label maps gain?"
-    return Page(question, answer, "maps.png", table, join_tables(losses, losses_at_bits), METHOD, gains)
+    return Page(answer, "maps.png", table, join_tables(losses, losses_at_bits), METHOD, gains)

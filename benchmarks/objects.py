@@ -115,6 +115,6 @@ def page(folder: Path, rows: list[Row]) -> Page:
             losses.append(f"- `{method}` and {number} clicks, below {BAD}: {failures}")
     table = means_table(rows, ["method", "clicks"], "", ("iou", "good", "failed", "core_seconds"))
     return Page(
-        "How well is an object cut out, by itself or by a box and clicks?", " ".join(sentences), "objects.png", table,
+        " ".join(sentences), "objects.png", table,
         "\n".join(losses), METHOD,
     )  # fmt: skip

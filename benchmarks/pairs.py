@@ -195,7 +195,6 @@ def page(folder: Path, rows: list[Row]) -> Page:
     texts = [_loss(folder, by_pair[comparison, image]) for _, comparison, image in sorted(losses)]
     shares = {line[0]: [int(count) for count in line[3:]] for line in lines}
     save_shares(folder / "pairs.png", ("for kcgs", "for the other", "for none"), shares, "answers")
-    question = "Which of two images would viewers rather have in a photo's place?"
     published = f"The hash of the key is `{(folder / 'key.sha256').read_text().split()[0]}`."
     answer = (
         f"Most viewers preferred kcgs on {', '.join(sentences)}. The other image "
@@ -206,7 +205,7 @@ def page(folder: Path, rows: list[Row]) -> Page:
     header = ["comparison", "kcgs preferred", "other preferred", "answers for kcgs", "for the other", "for none"]
     checked = f"The same answer with sides swapped, and none for equal images: {'; '.join(checks)}." if checks else ""
     losses_text = markdown(["comparison", "photo", "what viewers said", "sheet"], texts) if texts else ""
-    return Page(question, answer, "pairs.png", markdown(header, lines), losses_text, f"{METHOD} {published} {checked}")
+    return Page(answer, "pairs.png", markdown(header, lines), losses_text, f"{METHOD} {published} {checked}")
 
 
 def _sign(answer: Row) -> int:

@@ -1,4 +1,4 @@
-"""How good are previews of a few hundred bytes?"""
+"""How good are previews of a few hundred bytes, beside those of other codecs?"""
 
 from __future__ import annotations
 
@@ -144,7 +144,6 @@ def page(folder: Path, rows: list[Row]) -> Page:
         f"higher in {count_wins(rows, webp, 'ssimulacra2', CASES)}."
     )
     table = means_table(rows, ["method"], "target_bytes", ("delta_e", "ssimulacra2", "psnr"))
-    question = "How good are previews of a few hundred bytes, beside those of other codecs?"
     losses = losses_table(rows, COMPARISONS, QUANTITIES, CASES)
     gains = differences(rows, COMPARISONS, QUANTITIES, CASES)
-    return Page(question, answer, "previews.jpg", table, losses, METHOD, gains)
+    return Page(answer, "previews.jpg", table, losses, METHOD, gains)

@@ -61,7 +61,4 @@ def page(folder: Path, rows: list[Row]) -> Page:
     ]
     table = means_table([*rows, *printed], ["method"], "image", QUANTITIES)
     losses = losses_table(rows, [*COMPARISONS, OF_CHARTS], QUANTITIES, [])
-    question = "Does the paper's method do what the paper says, at its full length?"
-    return Page(
-        question, answer, "published.png", table, losses, METHOD, differences(photos, COMPARISONS, QUANTITIES, [])
-    )
+    return Page(answer, "published.png", table, losses, METHOD, differences(photos, COMPARISONS, QUANTITIES, []))

@@ -96,7 +96,6 @@ def page(folder: Path, rows: list[Row]) -> Page:
     losses = losses_table(rows, COMPARISONS, QUANTITIES, CASES)
     losses_at_bits = losses_table(equal, [EQUAL_BITS], DECODED, CASES)
     return Page(
-        "What do regions gain with the same number of Gaussians, in the same time?",
         answer,
         "quality.png",
         means_table(rows, ["group", "method"], "n", QUANTITIES),

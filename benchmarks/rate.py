@@ -169,5 +169,4 @@ def page(folder: Path, rows: list[Row]) -> Page:
     table = means_table([*fitting, *printed], ["group", "method"], "target_bytes", ("psnr", "ssimulacra2"))
     losses = losses_table(equal, comparisons, ("psnr", "ef_psnr", "ssimulacra2"), CASES)
     gains = differences(equal, comparisons, QUANTITIES, CASES)
-    question = "How good are files of so many bytes, beside those of other codecs?"
-    return Page(question, answer, "rate.png", table, losses, METHOD, gains)
+    return Page(answer, "rate.png", table, losses, METHOD, gains)

@@ -178,7 +178,7 @@ def page(folder: Path, rows: list[Row]) -> Page:
         if ratio < 1
     ]
     losses = f"More cores are slower than one, times as fast: {', '.join(slow)}." if slow else ""
-    return Page("How fast and how exactly does each backend render?", answer, "render.png", table, losses, METHOD)
+    return Page(answer, "render.png", table, losses, METHOD)
 
 
 def _span(ratios: list[float]) -> str:

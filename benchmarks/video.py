@@ -98,5 +98,4 @@ def page(folder: Path, rows: list[Row]) -> Page:
     )
     table = means_table(rows, ["image", "method"], "", QUANTITIES)
     losses = losses_table(rows, [COMPARISON], QUANTITIES, [])
-    question = "How good, calm and fast is the fit of a video, beside fits of its frames alone?"
-    return Page(question, answer, "video.png", table, losses, METHOD, differences(rows, [COMPARISON], QUANTITIES, []))
+    return Page(answer, "video.png", table, losses, METHOD, differences(rows, [COMPARISON], QUANTITIES, []))

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import torch
@@ -53,9 +54,8 @@ class Options(NamedTuple):
 
 
 class Page(NamedTuple):
-    """A report."""
+    """A report; its question is the first line of the module."""
 
-    question: str
     answer: str  # in two sentences
     figure: str  # file beside the report
     table: str
@@ -106,7 +106,8 @@ def run_experiment(
     report = page(options.output, read_rows(options.output / RESULTS_FILE))
     if report.differences:
         write_rows(options.output / DIFFERENCES_FILE, report.differences)
-    (options.output / "report.md").write_text(_text(report, run), encoding="utf-8")
+    question, _, _ = (_module_of(page).__doc__ or "").partition("\n")
+    (options.output / "report.md").write_text(_text(question, report, run), encoding="utf-8")
 
 
 def write_rows(path: Path, rows: Sequence[Row]) -> None:
@@ -136,11 +137,15 @@ def _number(text: str) -> float | int | str:
     return text
 
 
-def _path(folder: Path, measure: Measure, job: Job) -> Path:
-    module = inspect.getmodule(measure)
+def _module_of(function: Callable[..., Any]) -> ModuleType:
+    module = inspect.getmodule(function)
     assert module is not None
+    return module
+
+
+def _path(folder: Path, measure: Measure, job: Job) -> Path:
     # what is above `page` measures; a report may be written anew from its rows
-    text = inspect.getsource(module).partition("\ndef page(")[0]
+    text = inspect.getsource(_module_of(measure)).partition("\ndef page(")[0]
     parts = [measure.__module__, text, job, _sources()]
     key = hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
     return folder / f"{str(job['image']).replace('/', '-')}-{key[:20]}.json"
@@ -204,8 +209,8 @@ def _machine() -> str:
     return f"{processor}, {os.cpu_count()} cores; {python}; kcgs {kcgs.__version__}, {versions}"
 
 
-def _text(page: Page, run: dict[str, Any]) -> str:
-    parts = [f"# {page.question}", QUICK_NOTE if run["quick"] else "", run["note"], page.answer]
+def _text(question: str, page: Page, run: dict[str, Any]) -> str:
+    parts = [f"# {question}", QUICK_NOTE if run["quick"] else "", run["note"], page.answer]
     parts += [f"![]({page.figure})", page.table, "## Losses", page.losses or "None.", "## How", page.method]
     intervals = f", differences with 95 % intervals: [{DIFFERENCES_FILE}]({DIFFERENCES_FILE})"
     facts = [

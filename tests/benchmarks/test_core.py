@@ -49,7 +49,7 @@ def measure_square(image: str, number: int, folder: str) -> list[Row]:
 
 def square_page(folder: Path, rows: list[Row]) -> Page:
     answer = f"Sum: {sum(row['value'] for row in rows):g}"
-    return Page("How large?", answer, "a.png", "table", "", "Multiplied.", [{"method": "a - b", "value low": 1.5}])
+    return Page(answer, "a.png", "table", "", "Multiplied.", [{"method": "a - b", "value low": 1.5}])
 
 
 class TestExperiment:
