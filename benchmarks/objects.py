@@ -32,7 +32,7 @@ BAD = 0.5
 METHOD = f"""First frames of DAVIS with their masks. The box is that of the mask, larger by {MARGIN:.0%} on each side.
 Each click is in the middle of the largest wrong area, on its pixel that is farthest from the border. IoU is the overlap
 with the mask, intersection over union; *good* is the share of frames with at least {GOOD}, *failed* that below {BAD}.
-`object` is the network ISNet, as kcgs downloads it."""
+`object` is the network ISNet, its default."""
 
 Mask = NDArray[np.bool_]
 
