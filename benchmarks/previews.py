@@ -44,7 +44,7 @@ METHOD = f"""Kodak's photos, reduced to {SIDE} pixels on the longer side. `kcgs`
 settings, without a map. WebP (method 6) and AVIF (speed 4) code the photo, or the photo reduced to one of
 {len(REDUCTIONS) - 1} sizes from a half to a sixteenth of each side and enlarged bicubically: of all files of at most
 so many bytes the one with the highest SSIMULACRA2. Where a codec has no file as small on some photos, the number of
-the others is behind their mean. ThumbHash has 21 to 25 bytes whatever the budget, and is enlarged
+the others is behind their mean. ThumbHash has 21 bytes whatever the budget, and is enlarged
 bicubically from 32 pixels. deltaE 2000 is the mean over pixels. Butteraugli is its largest distance, by Debian's
 package of that name, of 2017; other versions have other scales. A file of the other codecs, at a size that wins,
 takes less than 0.5 s. Table: deltaE 2000 / SSIMULACRA2 / PSNR in dB. The figure shows eight photos at

@@ -32,8 +32,8 @@ METHOD = """First frames of DAVIS with the given masks, photos of Kodak with the
 methods run as long as `best` takes for its 700 iterations, on one core: two short fits of each tell how many iterations
 that are, and schedules are shortened by the recipes' own rule. `best-baseline` is `best` without regions;
 `gaussian-image` is the paper's baseline, with `clamp` as published; `image-gs, L1 alone` is Image-GS as a plain sum,
-where the publication takes a weighted mean of ten Gaussians, and without the SSIM loss, with which it would have 20
-iterations. Table: PSNR / EF-PSNR in dB; EF-PSNR is within 5 pixels of the contours of the map that was given. At equal
+where the publication takes a weighted mean of ten Gaussians, and without the SSIM loss, with which it would have a
+tenth of the iterations. Table: PSNR / EF-PSNR in dB; EF-PSNR is within 5 pixels of the contours of the map that was given. At equal
 bits, decoded files are compared with the baseline's at as many bytes, map included, interpolated between its own files
 of that image."""
 

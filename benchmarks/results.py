@@ -53,8 +53,8 @@ kcgs are within 0.002 of exact ones at its default cutoff. Milliseconds of one i
 TAIL = """
 ## How figures are taken
 
-- PSNR, MS-SSIM and SSIMULACRA2 are over the whole image. EF-PSNR is within 5 pixels of the contours of the given map,
-  for every method alike.
+- PSNR, MS-SSIM and SSIMULACRA2 are over the whole image. EF-PSNR is within 5 pixels of the contours of the map that was
+  given or found, for every method alike.
 - *Bytes* are those of the whole `.kcgs` file, map included. *At equal bits*, decoded files are compared with the
   other method's at as many bytes of the same image; its curve is interpolated by monotone cubics over the logarithm
   of the bytes.
