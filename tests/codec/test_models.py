@@ -52,6 +52,14 @@ class TestWriter:
         assert len(data) <= cost / 8 + 1.1
         assert np.array_equal(Reader(data).bits(chances, values), values)
 
+    @pytest.mark.parametrize("size", [1, 2, 1 << 16, (1 << 16) + 1, 3 << 20, 1 << 40])
+    def test_numbers_of_any_size(self, size: int) -> None:
+        """A number is its bits above the low 16, of which there may be many, then the low 16."""
+        numbers, writer = sorted({0, size // 3, size // 2, size - 1}), Writer()
+        assert [writer.number(number, size) for number in numbers] == numbers
+        reader = Reader(writer.finish())
+        assert [reader.number(0, size) for _ in numbers] == numbers
+
 
 class TestRankTree:
     @pytest.mark.parametrize("count", [1, 2, 7, 8, 100])
