@@ -22,7 +22,7 @@ from kcgs.codec.labels.stream import encode_stream
 from .codec.test_hostile import forge_map
 from .codec.test_label_files import DTYPES
 
-SIDE = 2000
+SIDE = 3000
 SLACK = 12_000_000  # bytes
 PER_PIXEL = 6  # bytes
 # reads each case in a copy of one process that has loaded everything: a peak is that of a copy alone

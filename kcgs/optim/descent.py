@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
 
@@ -14,6 +14,7 @@ from .gaussians import Gaussians, Renderer
 from .objectives import Objective
 
 
+@runtime_checkable
 class FieldOptimizer(Protocol):
     """What a fit calls of an optimizer, as :class:`GaussianAdam` has it; masks are bool, (..., N)."""
 
