@@ -227,8 +227,7 @@ class TestFailures:
 
 
 class TestBatches:
-    @pytest.mark.parametrize("regions", ["none", "auto"])
-    @pytest.mark.parametrize("suffix", [".safetensors", ".kcgs"])
+    @pytest.mark.parametrize(("regions", "suffix"), [("none", ".safetensors"), ("auto", ".kcgs")])
     def test_the_files_of_a_batch_are_those_of_images_alone(self, fit_many: Kcgs, regions: str, suffix: str) -> None:
         """Also with an image of another size, one that nobody can read, and one that lies on its side."""
         Image.new("RGB", (20, 30), "red").save("photos/tall.png")
