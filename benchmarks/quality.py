@@ -34,8 +34,8 @@ that are, and schedules are shortened by the recipes' own rule. `best-baseline` 
 `gaussian-image` is the paper's baseline, with `clamp` as published; `image-gs, L1 alone` is Image-GS as a plain sum,
 where the publication takes a weighted mean of ten Gaussians, and without the SSIM loss, with which it would have a
 tenth of the iterations. Table: PSNR / EF-PSNR in dB; EF-PSNR is within 5 pixels of the contours of the map that was
-given. At equal bits, decoded files are compared with the baseline's at as many bytes, map included, interpolated between its own files
-of that image."""
+given. At equal bits, decoded files are compared with the baseline's at as many bytes, map included, interpolated
+between its own files of that image."""
 
 
 def measure(image: str, group: str, n: int, data: str, quick: bool) -> list[Row]:
