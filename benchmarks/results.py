@@ -15,7 +15,7 @@ HEAD = """# Results
 
 Each answer links to a report of one page: its table, its losses, its command, and the tree of `kcgs/` that was
 measured. Since the tree `ebcceda` of 27 November 2026 renders, fits and files have the same bits, by the values in
-`tests/golden`. Some reports say that they are older than that. Since them fits add Gaussians in rounds, and remove
+`tests/golden`. Some reports say that they are older. After them fits began to add Gaussians in rounds, and to remove
 those that others overlap; label maps, files of a given scene and renders by the CPU kernel kept their bits. Three
 photos each of `maps`, `enlarge` and `previews` were measured again: the mean PSNR differs by at most 0.03 dB.
 
