@@ -30,8 +30,7 @@ TYPES = {
 
 @needs_triton
 @pytest.mark.skipif(os.environ.get("TRITON_INTERPRET") == "1", reason="the interpreter does not compile")
-@pytest.mark.parametrize("capability", [80, 90])
-@pytest.mark.parametrize(("channels", "mapped"), [(3, True), (32, False)])
+@pytest.mark.parametrize(("capability", "channels", "mapped"), [(80, 3, True), (90, 32, False)])
 def test_compiles_without_a_gpu(
     capability: int, channels: int, mapped: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
