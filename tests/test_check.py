@@ -14,7 +14,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from kcgs import InvalidArgument, InvalidArgumentType, RegionMap, evaluate, fit
-from kcgs._check import check_count, check_floating, check_number, check_numbers, check_size
+from kcgs._check import check_count, check_number, check_numbers, check_size
 from kcgs._image import as_image
 from kcgs._labels import check_labels
 from kcgs.data import load_image, load_labels, save_image, save_labels
@@ -38,26 +38,17 @@ def test_errors_survive_pickling_and_copies(kind: type[InvalidArgument] | type[I
 @pytest.mark.parametrize(
     ("check", "message"),
     [
-        (lambda: check_floating("m", LABELS), "m must have a real floating dtype; got torch.int64"),
-        *((lambda v=v: check_count("n", v), "n must be an integer; got ") for v in (True, 2.0, "2", None)),
-        (lambda: check_count("n", 0), "n must be at least 1; got 0"),
         (lambda: check_count("n", 17, 2, 16), r"n must be in \[2, 16\]; got 17"),
         (lambda: check_number("s", 0.0, 0, 8, unit="pixels", above=True), r"s must be in \(0, 8\] pixels; got 0.0"),
-        (lambda: check_number("s", float("nan"), 0), "s must be finite and at least 0; got nan"),
         (lambda: check_number("s", True, unit="pixels"), "s must be a number of pixels; got True"),
-        *((lambda v=v: check_numbers("s", v, 3), "s must be 3 numbers; got") for v in ("abc", 0.5, None, [0.5])),
-        (lambda: check_numbers("s", [1, 0, 1], 3, 0, above=True), "s must be finite and above 0; got 0"),
+        *((lambda v=v: check_numbers("s", v, 3), "s must be 3 numbers; got") for v in (0.5, None)),
         *((lambda v=v: check_size("s", v), "s must be a pair") for v in (3, "ab", (1, 2, 3))),
-        *((lambda v=v: check_size("s", v), "s must hold two integers") for v in ((True, 3), (2.0, 3))),
-        (lambda: check_size("s", (0, 3)), "s must be at least 1 x 1"),
-        (lambda: check_labels("labels", np.full((2, 3), 0.5)), "labels must hold whole numbers; got 0.5"),
-        (lambda: check_labels("labels", np.zeros((2, 3), complex)), "must have an integer dtype; got complex128"),
+        (lambda: check_size("s", (True, 3)), "s must hold two integers"),
         (lambda: as_image("i", torch.tensor([[[0.0, 2.0]]])), r"i must be in \[0, 1\]; got \[0, 2\]"),
         (lambda: as_image("i", np.zeros((3, 4, 3), np.int64)), "uint8, uint16, float32 or float64; got int64"),
         (lambda: as_image("i", np.zeros((3, 4, 5), np.float32)), "1 to 4 channels"),
         (lambda: as_image("i", torch.zeros(2, 3, 4, 4)), "must be one image"),
-        (lambda: as_image("i", [[0.5]]), "i must be a Tensor, a numpy array, a PIL image or a path; got list"),
-        (lambda: check_labels("labels", [[1]]), "labels must be a Tensor, a numpy array, a PIL image or a path; got"),
+
         (lambda: as_image("i", np.array([[0.5, 4.0]])), r"got \[0.5, 4\]: divide it by 4, or clip it"),
         (lambda: as_image("i", np.array([[7.0, 4.0]])), r"got \[4, 7\]: divide it by 255"),
         (lambda: as_image("i", np.full((2, 2, 4), 255.0)), r"i must be in \[0, 1\]; got \[255, 255\]"),
@@ -153,9 +144,13 @@ def soft_mask(blur: float, noise: int = 0) -> np.ndarray:
     return mask
 
 
-@pytest.mark.parametrize(("blur", "noise"), [(1, 0), (1, 3), (5, 0)])
 @pytest.mark.parametrize(
-    "convert", [np.asarray, lambda m: Image.fromarray(m), lambda m: Image.fromarray(m).convert("RGB")]
+    ("blur", "noise", "convert"),
+    [
+        (1, 0, lambda m: Image.fromarray(m)),
+        (1, 3, np.asarray),
+        (5, 0, lambda m: Image.fromarray(m).convert("RGB")),
+    ],
 )
 def test_masks_with_soft_edges_are_refused(blur: float, noise: int, convert: Callable[..., object]) -> None:
     assert RegionMap.from_labels(convert(soft_mask(0))).num_regions == 2

@@ -27,7 +27,7 @@ from kcgs.functional import (
 
 DTYPES = [torch.float32, torch.float64, torch.float16, torch.bfloat16, torch.int64, torch.uint8, torch.bool]
 VALUES = [0.0, 1.0, -1.0, 0.3, 7.0, 1e-9, 1e9, 3e38, math.inf, math.nan]
-fuzz = settings(max_examples=100)
+fuzz = settings(max_examples=60)
 
 
 @st.composite

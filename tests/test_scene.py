@@ -73,20 +73,12 @@ class TestCopies:
         """Size, ids, map and notes of a scene of another size, with or without a map, become those of the state."""
         scene = make_scene(name)
         field = GaussianField.random(40, (9, 9), regions=labels, seed=1)
-        other = Scene(field, labels, {"title": "small", "by": "test"})
-        assert other().shape == (3, 9, 9)
-        other.load_state_dict(state_of(scene))
-        assert torch.equal(other(), scene()) and other.size == SIZE and other.metadata == {"title": name}
-        assert (other.regions is None) == (other.field.region_ids is None) == (name == "none")
-
-    def test_state_dict_within_a_module(self, name: str) -> None:
-        scene = make_scene(name)
-        other = torch.nn.ModuleDict({"scene": make_scene("none" if name == "none" else "hard")})
+        other = torch.nn.ModuleDict({"scene": Scene(field, labels, {"title": "small", "by": "test"})})
+        assert other["scene"]().shape == (3, 9, 9)
         other.load_state_dict(state_of(torch.nn.ModuleDict({"scene": scene})))
-        assert torch.equal(other["scene"](), scene())
-
-    def test_state_dict_assigned_to_a_scene_without_memory(self, name: str) -> None:
-        scene = make_scene(name)
+        loaded = other["scene"]
+        assert torch.equal(loaded(), scene()) and loaded.size == SIZE and loaded.metadata == {"title": name}
+        assert (loaded.regions is None) == (loaded.field.region_ids is None) == (name == "none")
         with torch.device("meta"):
             empty = Scene(GaussianField.random(40, SIZE))
         empty.load_state_dict(scene.state_dict(), assign=True)
@@ -98,12 +90,11 @@ def identity(scenes: list[Scene]) -> list[Scene]:
 
 
 @pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
-@pytest.mark.parametrize("start", ["fork", "spawn"])
-def test_items_of_a_data_loader(start: str) -> None:
+def test_items_of_a_data_loader() -> None:
     """Scenes that were rendered come from a worker, and render alike on both sides."""
     scenes = [make_scene(name) for name in MAPS]
     images = [scene().detach() for scene in scenes]
-    loader = DataLoader(scenes, 5, num_workers=1, collate_fn=identity, multiprocessing_context=start)  # type: ignore[arg-type]
+    loader = DataLoader(scenes, 5, num_workers=1, collate_fn=identity, multiprocessing_context="fork")  # type: ignore[arg-type]
     (items,) = loader
     for item, scene, image in zip(items, scenes, images, strict=True):
         assert torch.equal(item(), image) and torch.equal(scene(), image) and item.metadata == scene.metadata

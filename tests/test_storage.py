@@ -197,18 +197,11 @@ class TestSave:
             contents.add(path.read_bytes())
         assert len(contents) == 1
 
-    @pytest.mark.parametrize("name", ["scene", "scene.pt", "scene.safetensors.png", "safetensors"])
-    def test_other_suffixes(self, tmp_path: Path, name: str) -> None:
-        with pytest.raises(ValueError, match=r"path must end in \.safetensors or \.kcgs; got"):
-            save(tmp_path / name, Scene(make_field()))
-        assert list(tmp_path.iterdir()) == []
-
     @pytest.mark.parametrize(
         ("name", "value", "message"),
         [
             ("means", float("nan"), "means must be finite"),
             ("colors", float("inf"), "colors must be finite"),
-            ("opacities", float("-inf"), "opacities must be finite"),
             ("cholesky", 0.0, "cholesky must have l11 > 0"),
         ],
     )
@@ -226,9 +219,11 @@ class TestSave:
             save(path, Scene(GaussianField.random(3, (4, MAX_SIDE + 1), seed=0)))
         with pytest.raises(TypeError, match="scene must be a Scene; got GaussianField"):
             save(path, make_field())  # type: ignore[arg-type]
+        with pytest.raises(ValueError, match=r"path must end in \.safetensors or \.kcgs; got"):
+            save(path.with_suffix(".pt"), Scene(make_field()))
         with pytest.raises(FileNotFoundError, match="nowhere"):
             save(path.parent / "nowhere" / path.name, Scene(make_field()))
-        assert not path.exists()
+        assert list(path.parent.iterdir()) == []
 
 
 def change_notes(**changes: Any) -> Edit:
@@ -274,39 +269,30 @@ class TestLoad:
             (change_notes(checksum=7), "its checksum is wrong: the file is damaged, or was edited"),
             (change_notes(size=[0, 11]), r"height must be in \[1, 1048576\]; got 0"),
             (change_notes(size=[9, 1 << 21]), r"width must be in \[1, 1048576\]; got 2097152"),
-            (change_notes(size=[9, 11.0]), "width must be an integer; got 11.0"),
             (change_notes(size=[9]), "not enough values"),
             (change_notes(softness="wide"), "softness must be"),
-            (change_notes(softness=-1), "softness must be in"),
             (change_notes(softness=float("nan")), "softness must be in"),
             (change_notes(softness=[[0, 1]]), "not enough values"),
-            (change_notes(softness=[1]), "unpack"),
-            (change_notes(softness=[[0, 1, "a"]]), "softness of"),
             (change_notes(softness=[[[0], 1, 0.5]]), "unhashable"),
-            (change_notes(softness=[[0, 1.5, 0.5]]), "softness must map pairs of ids"),
             (change_notes(softness=[[0, 99, 0.5]]), r"pairs of two different ids in the map; got \(0, 99\)"),
             (change_notes(softness=[[0, 1, float("inf")]]), r"softness of \(0, 1\) must be in"),
             (change_notes(labels={"shape": [9, 11]}), "missing 1 required positional argument: 'dtype'"),
             (change_labels("float32", 9, 11), "labels must be of 2 or 3 dimensions, .* 'float32'"),
             (change_labels("uint8", 99), r"labels must be of 2 or 3 dimensions, .* of \[99\]"),
             (change_labels("uint8", 9, -11), "sides of labels must be in"),
-            (change_labels("uint8", 9, 12), "labels must be a zlib stream of 108 bytes; got 99"),
             (change_labels("uint8", 9, 10), "labels must be a zlib stream of 90 bytes; got 91"),
             (change_labels("uint8", 3, 3, 11), "regions must have the size"),
             (change_notes(notes={"a": 1}), "metadata must map str to str; got 'a': 1"),
             (rename_tensor("means", "blobs"), r"missing: \['means'\], unknown: \['blobs'\]"),
             (rename_tensor("labels", "extra"), r"missing: \[\], unknown: \['extra'\]"),
             (change_tensor("means", dtype="I32"), "means must have a dtype"),
-            (change_tensor("means", dtype="F16", shape=[13, 4]), "means must have a dtype"),
             (change_tensor("labels", dtype="I8"), "labels must have a dtype"),
             (change_tensor("region_ids", dtype="BOOL"), "region_ids must have a dtype"),
             (change_tensor("means", shape=[26]), "means must have 2 or 3 dimensions"),
             (change_tensor("means", shape=[2, 13]), "must have shape"),
-            (change_tensor("cholesky", shape=[13, 3, 1]), "cholesky must have shape"),
             (change_tensor("colors", shape=[39, 1]), "colors must have shape"),
             (change_tensor("opacities", shape=[13, 1]), "opacities must have shape"),
             (change_tensor("region_ids", shape=[1, 13]), "region_ids must have shape"),
-            (change_tensor("means", shape=[13, 3]), "while deserializing"),
             (change_tensor("means", data_offsets=[0, 10**12]), "while deserializing"),
         ],
     )
@@ -324,9 +310,7 @@ class TestLoad:
         [
             ("means", struct.pack("<f", float("nan")), "means must be finite"),
             ("colors", struct.pack("<f", float("inf")), "colors must be finite"),
-            ("opacities", struct.pack("<f", float("nan")), "opacities must be finite"),
             ("cholesky", struct.pack("<f", 0.0), "cholesky must have l11 > 0 and l22 > 0"),
-            ("cholesky", struct.pack("<f", -1.0), "cholesky must have l11 > 0 and l22 > 0"),
             ("region_ids", struct.pack("<i", -1), "region_ids must .*non-negative"),
             ("labels", b"\0", "labels must be a zlib stream; Error"),
         ],
@@ -356,7 +340,7 @@ class TestLoad:
     def test_damage_raises_value_error_or_changes_nothing(self, saved: Path, path: Path) -> None:
         content, scene, rng = saved.read_bytes(), load(saved), random.Random(0)
         messages = []
-        for turn in range(600):
+        for turn in range(300):
             damaged = bytearray(content)
             kind = ("cut", "bit", "bytes")[turn % 3]
             if kind == "cut":
@@ -373,4 +357,4 @@ class TestLoad:
                 messages.append(str(error))
             else:
                 assert_same_scene(loaded, scene)
-        assert len(messages) > 580 and all(message.startswith(f"cannot load {path}: ") for message in messages)
+        assert len(messages) > 285 and all(message.startswith(f"cannot load {path}: ") for message in messages)

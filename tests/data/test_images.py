@@ -161,8 +161,14 @@ class TestLoadImage:
         with pytest.warns(UserWarning, match="a.png has transparent pixels: they are composed on white"):
             assert (load_image(path) == 1).all()
 
-    @pytest.mark.parametrize("orientation", range(1, 9))
-    @pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP", "TIFF", "16-bit PNG", "16-bit TIFF"])
+    @pytest.mark.parametrize(
+        ("kind", "orientation"),
+        [
+            *(("JPEG", k) for k in range(1, 9)),
+            *((kind, 6) for kind in ("PNG", "WEBP", "TIFF")),
+            *((f"16-bit {kind}", k) for kind in ("PNG", "TIFF") for k in (5, 8)),
+        ],
+    )
     def test_orientation(self, tmp_path: Path, kind: str, orientation: int) -> None:
         corners = np.zeros((16, 24, 3), np.uint8)
         corners[:8, :8], corners[8:, 16:] = (255, 0, 0), (0, 0, 255)
@@ -221,7 +227,7 @@ class TestLoadImage:
             load_image(path)
 
     @pytest.mark.parametrize("kind", WHOLE)
-    @settings(max_examples=30)
+    @settings(max_examples=20)
     @given(data=st.data())
     def test_damaged_bytes_give_an_image_or_value_error(self, tmp_path: Path, kind: str, data: st.DataObject) -> None:
         damaged = bytearray(WHOLE[kind])
@@ -245,11 +251,15 @@ class TestLoadImage:
 
 
 class TestSaveImage:
-    @pytest.mark.parametrize("suffix", [".png", ".webp", ".tif", ".tiff", ".bmp", ".PNG"])
-    @pytest.mark.parametrize(("samples", "channels"), [(GREY, "L"), (RGB, "RGB"), (RGBA, "RGBA")])
+    @pytest.mark.parametrize(
+        ("suffix", "samples", "channels"),
+        [
+            *((suffix, RGBA, "RGBA") for suffix in (".png", ".webp", ".tif", ".tiff", ".PNG")),
+            *((suffix, GREY, "L") for suffix in (".png", ".webp", ".tif", ".bmp")),
+            *((suffix, RGB, "RGB") for suffix in (".png", ".webp", ".tif", ".bmp")),
+        ],
+    )
     def test_round_trip(self, tmp_path: Path, suffix: str, samples: np.ndarray, channels: Any) -> None:
-        if channels == "RGBA" and suffix == ".bmp":
-            pytest.skip("BMP has no alpha")
         levels = torch.from_numpy(samples).permute(2, 0, 1).float() / 255
         save_image(tmp_path / f"a{suffix}", levels)
         image = load_image(tmp_path / f"a{suffix}", channels=channels)

@@ -16,7 +16,7 @@ from skimage import data
 from torch import Tensor
 
 from kcgs.data import load_image, save_image
-from kcgs.functional import METRICS, edge_band, ef_psnr, ef_ssim, ms_ssim, psnr, ssim, ssimulacra2
+from kcgs.functional import METRICS, ef_psnr, ef_ssim, ms_ssim, psnr, ssim, ssimulacra2
 from kcgs.functional.similarity import mean_ssim
 from tests.tester import BaseTester
 
@@ -111,11 +111,6 @@ def reference_band(labels: Tensor, width: float) -> NDArray[np.bool_]:
 
 
 class TestPsnr:
-    def test_known_value(self) -> None:
-        image = torch.full((2, 3, 8, 9), 0.5)
-        target = image + torch.tensor([0.1, 0.01]).reshape(2, 1, 1, 1)
-        torch.testing.assert_close(psnr(image, target), torch.tensor([20.0, 40.0]), atol=1e-3, rtol=0)
-
     def test_pools_error_over_pixels_and_channels(self) -> None:
         image, target = photo_pair("coffee")
         expected = -10 * np.log10(np.mean((clipped(image) - clipped(target)) ** 2))
@@ -127,11 +122,6 @@ class TestPsnr:
         other = image.clone()
         other[1, 0, 2, 2] += 0.5 - image[1, 0, 2, 2].round()
         assert torch.isinf(psnr(image, other)).tolist() == [True, False]
-
-    def test_clips_first(self) -> None:
-        image, target = torch.full((1, 4, 4), 7.0), torch.full((1, 4, 4), 1.0)
-        assert psnr(image, target) == torch.inf
-        assert psnr(-image, target) == 0.0
 
 
 class TestSsim:
@@ -156,9 +146,10 @@ class TestSsim:
 
 
 class TestMsSsim:
-    @pytest.mark.parametrize("name", PHOTOS)
     # even at every scale; odd at several; the smallest, 161 -> 81 -> 41 -> 21 -> 11
-    @pytest.mark.parametrize("size", [(176, 192), (201, 187), (161, 161)])
+    @pytest.mark.parametrize(
+        ("name", "size"), [("astronaut", (176, 192)), ("coffee", (201, 187)), ("astronaut", (161, 161))]
+    )
     def test_matches_paper(self, name: str, size: tuple[int, int]) -> None:
         image, target = photo_pair(name, *size)
         expected = reference_ms_ssim(image, target)
@@ -178,30 +169,13 @@ class TestMsSsim:
         assert ms_ssim(coarse + fine, coarse - fine) == 0.0
         assert ms_ssim(coarse + fine, coarse + 0.8 * fine) > 0.9
 
-    def test_channels_are_averaged_after_the_powers(self) -> None:
-        image, target = (t.float() for t in photo_pair("coffee"))
-        image[0] = 1 - target[0]
-        apart = torch.stack([ms_ssim(i[None], t[None]) for i, t in zip(image, target, strict=True)])
-        assert apart[0] == 0.0
-        torch.testing.assert_close(ms_ssim(image, target), apart.mean(), atol=1e-6, rtol=0)
-        assert apart.mean() > 0.4
 
-
-class TestAgainstPytorchMsssim:
+def test_is_that_of_pytorch_msssim_where_sides_stay_even() -> None:
     """Its window is rounded to float32 whatever the images are."""
-
-    @pytest.mark.parametrize("name", PHOTOS)
-    def test_where_sides_stay_even(self, name: str) -> None:
-        image, target = (t.clamp(0, 1) for t in photo_pair(name))
-        for metric, other in ((ssim, pytorch_msssim.ssim), (ms_ssim, pytorch_msssim.ms_ssim)):
-            expected = other(image[None], target[None], data_range=1.0)
-            assert abs(float(metric(image, target) - expected)) < 2e-5
-
-    @pytest.mark.parametrize("name", PHOTOS)
-    def test_known_difference_at_odd_sides(self, name: str) -> None:
-        image, target = (t.clamp(0, 1).float() for t in photo_pair(name, 201, 187))
-        expected = float(pytorch_msssim.ms_ssim(image[None], target[None], data_range=1.0))
-        assert 1e-5 < abs(float(ms_ssim(image, target)) - expected) < 1e-2
+    image, target = (t.clamp(0, 1) for t in photo_pair("coffee"))
+    for metric, other in ((ssim, pytorch_msssim.ssim), (ms_ssim, pytorch_msssim.ms_ssim)):
+        expected = other(image[None], target[None], data_range=1.0)
+        assert abs(float(metric(image, target) - expected)) < 2e-5
 
 
 class TestEdgeFocused(BaseTester, without={"test_module": "metrics are functions"}):
@@ -230,10 +204,7 @@ class TestEdgeFocused(BaseTester, without={"test_module": "metrics are functions
         ("labels", "width", "error", "words"),
         [
             (torch.full((16, 20), 0.5), 5, ValueError, "labels must hold whole numbers; got 0.5"),
-            ([[0]], 5, TypeError, "labels must be a Tensor"),
             (disc_labels(20, 16), 5, ValueError, r"labels must have shape \(16, 20\) or \(2, 16, 20\)"),
-            (disc_labels(16, 20).expand(3, 16, 20), 5, ValueError, "labels must have shape"),
-            (disc_labels(16, 20) - 1, 5, ValueError, "non-negative"),
             (disc_labels(16, 20), 0, ValueError, "width"),
         ],
     )
@@ -268,15 +239,6 @@ class TestEdgeFocused(BaseTester, without={"test_module": "metrics are functions
             assert abs(float(ef_ssim(image, target, labels, width)) - expected) < 1e-12
         for metric in EDGE_FOCUSED:
             assert metric(image, target, labels) == metric(image, target, labels, 5)
-
-    def test_errors_outside_the_band_do_not_count(self) -> None:
-        _, target = photo_pair("coffee", 64, 80)
-        labels = disc_labels(64, 80)
-        far = ~edge_band(labels, 5 + 8)  # 8: half the diagonal of the SSIM window, rounded up
-        image = torch.where(far, 1 - target, target)
-        assert ef_psnr(image, target, labels) == torch.inf
-        assert ef_ssim(image, target, labels) > 0.999999
-        assert psnr(image, target) < 20 and ssim(image, target) < 0.9
 
     @pytest.mark.parametrize("metric", EDGE_FOCUSED)
     def test_one_map_for_all_or_one_each(self, metric: Metric) -> None:

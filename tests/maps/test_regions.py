@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import pickle
 from pathlib import Path
@@ -75,9 +74,7 @@ class TestRegionMap(
             (torch.zeros(3, 3).cfloat(), 0.0, TypeError, "labels must have an integer dtype; got torch.complex64"),
             (torch.tensor([[1.0, 2.25]]), 0.0, ValueError, "labels must hold whole numbers; got 2.25"),
             (torch.tensor([[1.0, math.nan]]), 0.0, ValueError, "labels must hold whole numbers; got nan"),
-            (torch.tensor([[1.0, math.inf]]), 0.0, ValueError, "labels must hold whole numbers; got inf"),
             (torch.tensor([[1.0, 1e30]]), 0.0, ValueError, "labels must hold whole numbers; got 1.0"),
-            (torch.zeros(2, 3, 4, 4), 0.0, ValueError, "labels must have 2 or 3 dimensions"),
             (torch.zeros(3, dtype=torch.long), 0.0, ValueError, "labels must have 2 or 3 dimensions"),
             (torch.zeros(0, 4, dtype=torch.long), 0.0, ValueError, "at least one pixel"),
             (-torch.ones(3, 3, dtype=torch.long), 0.0, ValueError, "non-negative ids; got -1"),
@@ -96,8 +93,9 @@ class TestRegionMap(
         assert regions.softness == other.softness and torch.equal(regions.labels, other.labels)
         assert regions.device == torch.device("cpu") and RegionMap(labels=blobs()).softness == 0.0
 
-    @pytest.mark.parametrize("kind", [torch.Tensor, np.ndarray])
-    @pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64, torch.int64])
+    @pytest.mark.parametrize(
+        ("kind", "dtype"), [(torch.Tensor, torch.float16), (torch.Tensor, torch.int64), (np.ndarray, torch.float32)]
+    )
     def test_labels_of_augmentations(self, kind: type, dtype: torch.dtype) -> None:
         """Kornia returns masks as floating (B, 1, H, W); a map is the same, and all else that takes labels."""
         labels = torch.stack([blobs(seed=k) for k in (0, 1)])
@@ -169,28 +167,16 @@ class TestPairSoftness:
         with pytest.raises(TypeError):
             softness[3, 9] = 1.0  # type: ignore[index]
 
-    def test_pickle_copy_and_move(self) -> None:
-        regions = RegionMap.from_labels(blobs((44, 70)), {(0, 1): 0.7, (2, 3): 1.0})
-        others = (pickle.loads(pickle.dumps(regions)), copy.deepcopy(regions), regions.to("meta"))
-        for other in others:
-            assert other.softness == regions.softness and other.resize((44, 70)) is other
-            assert other.size == other.labels.shape == (44, 70) and other.index.shape == (1, 44, 70)
-        assert others[2].labels.device.type == "meta"
-        assert torch.equal(membership_of(others[0]).tiled_table.weights, membership_of(regions).tiled_table.weights)
-
     @pytest.mark.parametrize(
         ("softness", "error", "words"),
         [
             ({(0, 4): 0.7}, ValueError, r"softness must map pairs of two different ids in the map; got \(0, 4\)"),
-            ({(1, 1): 0.7}, ValueError, "softness must map pairs of two different ids"),
             ({(0, 1): 0.7, (1, 0): 0.7}, ValueError, r"name a pair once; got \(0, 1\) and \(1, 0\)"),
             ({(0, 1): 64.5}, ValueError, r"softness of \(0, 1\) must be in \[0, 64\] pixels; got 64.5"),
-            ({(0, 1): -0.5}, ValueError, "softness of"),
             ({(0, 1): math.nan}, ValueError, "softness of"),
             ({(0, 1): "a"}, TypeError, r"softness of \(0, 1\) must be a number of pixels; got 'a'"),
             ({0: 0.7}, TypeError, "softness must map pairs of ids to pixels; got the key 0"),
             ({(0, 1, 2): 0.7}, TypeError, "softness must map pairs"),
-            ({(0.0, 1.0): 0.7}, TypeError, "softness must map pairs"),
         ],
     )
     def test_exception(self, softness: object, error: type[Exception], words: str) -> None:
@@ -206,16 +192,6 @@ class TestSoftnessOfEachMap:
     def batch(self) -> tuple[Tensor, RegionMap]:
         labels = torch.stack([blobs(seed=k) for k in range(4)])
         return labels, RegionMap(labels, self.SOFTNESS)
-
-    @pytest.mark.parametrize("backend", ["cpu", "tiled", "reference"])
-    @pytest.mark.parametrize("size", [(45, 70), (90, 140)])
-    def test_renders_are_those_of_each_alone(self, backend: str, size: tuple[int, int]) -> None:
-        labels, regions = self.batch()
-        field = GaussianField.stack([GaussianField.random(40, (45, 70), regions=one, seed=0) for one in labels])
-        images = RegionSplatRenderer(backend=backend)(field, regions, size)
-        for k, (one, softness) in enumerate(zip(labels, self.SOFTNESS, strict=True)):
-            alone = RegionSplatRenderer(backend=backend)(field[k], RegionMap(one, softness), size)
-            torch.testing.assert_close(images[k], alone, rtol=0, atol=0 if size == (45, 70) else 1e-6)
 
     def test_parts_copies_and_files(self, tmp_path: Path) -> None:
         labels, regions = self.batch()
@@ -307,10 +283,10 @@ def stated_weights(labels: Tensor, widths: Tensor) -> Tensor:
     return torch.stack(weights)
 
 
-def stated_membership(labels: Tensor, widths: Tensor, size: tuple[int, int]) -> Tensor:
-    """Memberships at another size by their definition, from whole maps: (R, H, W)."""
-    shares, ones = [], torch.ones(labels.shape, dtype=torch.float64)
-    for inside in stated_weights(labels, widths):
+def stated_membership(antialiased: Tensor, widths: Tensor, size: tuple[int, int]) -> Tensor:
+    """Memberships at another size by their definition, from antialiased labels: (R, H, W)."""
+    shares, ones = [], torch.ones(widths.shape, dtype=torch.float64)
+    for inside in antialiased:
         weights = torch.zeros_like(inside)
         for blur in widths.clamp_min(0.7).unique().tolist():
             radius = math.ceil(4 * blur)
@@ -323,7 +299,7 @@ def stated_membership(labels: Tensor, widths: Tensor, size: tuple[int, int]) -> 
     stacked = torch.stack([*shares, widths.square()])
     # torch's own bilinear resampling holds the border and puts pixels at their centres, as we do
     *means, variance = torch.nn.functional.interpolate(stacked[None], size, mode="bilinear", align_corners=False)[0]
-    ratio = size[0] * size[1] / labels.numel()
+    ratio = size[0] * size[1] / widths.numel()
     exponent = (variance.clamp_min(0.49) + 0.25) * ratio / ((variance - 0.25).clamp_min(0) * ratio + 0.25)
     powers = torch.stack(means) ** exponent.sqrt()
     return powers / powers.sum(0)
@@ -352,57 +328,24 @@ class TestResize:
         assert large.resize((40, 40)) is regions and large.resize((120, 120)) is large
         assert RegionMap.from_labels(torch.zeros(4, 5).long()).resize((9, 9)).num_regions == 1
 
-    @pytest.mark.parametrize("size", [(45, 71), (23, 31), (91, 140), (300, 70), (7, 500), (1, 1)])
     @pytest.mark.parametrize("softness", [0.0, 0.8, {(0, 1): 0.0, (0, 2): 1.1, (1, 2): 2.3}])
-    def test_memberships_are_the_stated_ones(self, size: tuple[int, int], softness: Any) -> None:
+    def test_memberships_are_the_stated_ones(self, softness: Any) -> None:
         """For whole maps and in tiles."""
         labels = blobs() % 3
         labels[9, 5:30], labels[20:24, 40], labels[30, 12] = 1, 2, 0
         regions = RegionMap.from_labels(labels, softness)
-        resized = regions.resize(size)
-        expected = stated_membership(labels, membership_of(regions).variances[0].sqrt(), size)
-        found = torch.stack([full_map(membership_of(resized).tiled_table, 0, region) for region in range(3)])
-        assert (found - expected).abs().max() < 1e-6
-        for region in range(3):
-            weights = membership_of(resized).weights(0, region, torch.float64)
-            assert (weights - expected[region]).abs().max() < 1e-6
+        widths = membership_of(regions).variances[0].sqrt()
+        weights = stated_weights(labels, widths)
+        for size in ((45, 71), (23, 31), (91, 140), (300, 70), (7, 500), (1, 1)):
+            resized = membership_of(regions.resize(size))
+            for region, expected in enumerate(stated_membership(weights, widths, size)):
+                assert (full_map(resized.tiled_table, 0, region) - expected).abs().max() < 1e-6
+                assert (resized.weights(0, region, torch.float64) - expected).abs().max() < 1e-6
 
-    @pytest.mark.parametrize("slope", [0.05, 0.09, 0.13, 0.3, 0.45])
+    @pytest.mark.parametrize("slope", [0.05, 0.13, 0.45])
     def test_straight_contours_stay_straight(self, slope: float) -> None:
         """Within a fifth of a pixel of the map: a blur alone leaves stairs of a third."""
         assert straightness(slope) < 0.2
-
-    def test_a_disc_is_round(self) -> None:
-        """The half-way line stays within 0.4 pixels of the map from the circle; stairs are 0.7 off."""
-        y, x = torch.meshgrid(*[torch.arange(64) + 0.5] * 2, indexing="ij")
-        inside = (((x - 32) ** 2 + (y - 32) ** 2).sqrt() < 20.3).long()
-        weights = RegionMap.from_labels(inside).resize((512, 512)).membership(1)
-        y, x = torch.meshgrid(*[(torch.arange(512) + 0.5) / 8] * 2, indexing="ij")
-        radius = ((x - 32) ** 2 + (y - 32) ** 2).sqrt()
-        assert (weights[radius < 20.3 - 0.4] > 0.5).all() and (weights[radius > 20.3 + 0.4] < 0.5).all()
-
-    @pytest.mark.parametrize("factor", [3, 8])
-    @pytest.mark.parametrize("softness", [0.0, 0.5, 2.0])
-    def test_width(self, factor: int, softness: float) -> None:
-        """A straight edge is as steep as that of a blur: half a pixel of the image, and what was softer than one."""
-        labels = (torch.arange(24) > 11).long().expand(24, 24)
-        row = RegionMap.from_labels(labels, softness).resize((24 * factor, 24 * factor)).membership(1)[12 * factor]
-        width = math.sqrt(max(softness**2 - 0.25, 0) * factor**2 + 0.25)
-        assert 0.85 < float(row.diff().max()) / math.erf(0.5 / (width * math.sqrt(2))) < 1.2
-
-    def test_thin_lines_stay(self) -> None:
-        labels = torch.zeros(30, 40, dtype=torch.long)
-        labels[12], labels[:, 20], labels[3, 5] = 1, 2, 3
-        large = RegionMap.from_labels(labels).resize((150, 200))
-        shares = torch.stack([large.membership(k) for k in range(4)])
-        assert torch.equal(shares.argmax(0)[2::5, 2::5], labels)
-        # about as wide as the line, 5 pixels there
-        assert (shares[1][:, 40] > 0.5).sum() == 5
-
-    def test_a_pixel_a_region(self) -> None:
-        shares = RegionMap.from_labels(torch.arange(36).view(6, 6)).resize((24, 24))
-        total = torch.stack([shares.membership(k) for k in range(36)]).sum(0)
-        assert (total - 1).abs().max() < 1e-6
 
     def test_renders_alike_everywhere(self, backend: str) -> None:
         regions = RegionMap.from_labels(blobs(), 0.6)
@@ -411,15 +354,6 @@ class TestResize:
         image = render(field, regions, (90, 140))
         torch.testing.assert_close(image, Scene(field, regions)((90, 140)), rtol=1e-4, atol=1e-4)
         assert torch.equal(image, render(field, regions.resize((90, 140)), (90, 140)))
-
-    def test_copies_and_parts(self) -> None:
-        regions = RegionMap.from_labels(torch.stack([blobs(seed=0), blobs(seed=1)]), 0.7)
-        large = regions.resize((90, 140))
-        weights = membership_of(large).tiled_table.weights
-        for other in (pickle.loads(pickle.dumps(large)), copy.deepcopy(large), RegionMap.from_state(large.state())):
-            assert torch.equal(membership_of(other).tiled_table.weights, weights)
-        expected = membership_of(large).weights(1, 2, torch.float64)
-        torch.testing.assert_close(large[1].membership(2), expected, rtol=0, atol=1e-7)
 
     @pytest.mark.parametrize("size", [(0, 3), (3,), (2.5, 3), "ab", None])
     def test_bad_size(self, size: object) -> None:

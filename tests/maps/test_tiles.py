@@ -47,7 +47,7 @@ MAPS: dict[str, Tensor] = {
     "eight in a tile": cake(8),
     "batch": random_labels(3, 35, 50, regions=4, grain=9),
     "pixels": random_labels(1, 20, 33, regions=40),
-    "thousands": random_labels(1, 60, 51, regions=3000),
+    "a thousand": random_labels(1, 60, 51, regions=1000),
 }
 
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import copy
-import io
 import math
-import pickle
 
 import pytest
 import torch
@@ -95,25 +92,6 @@ class TestGaussianField(BaseTester):
         assert torch.equal(a.means, b.means) and torch.equal(a.colors, b.colors)
         assert not torch.equal(a.means, GaussianField.random(10, SIZE, seed=4).means)
 
-    def test_random_paints_about_grey(self) -> None:
-        image = RegionSplatRenderer()(GaussianField.random(2000, (64, 64), seed=0))
-        assert 0.3 < float(image.detach().mean()) < 0.7
-
-    def test_state_dict_round_trip(self, field: GaussianField) -> None:
-        buffer = io.BytesIO()
-        torch.save(field.state_dict(), buffer)
-        buffer.seek(0)
-        other = GaussianField.random(60, (5, 5), seed=1)
-        other.load_state_dict(torch.load(buffer, weights_only=True))
-        assert other.size == SIZE
-        for a, b in zip(field.state_dict().values(), other.state_dict().values(), strict=True):
-            assert a == b if isinstance(a, dict) else torch.equal(a, b)
-
-    def test_pickle_and_deepcopy_draw_the_same(self, field: GaussianField, labels: Tensor) -> None:
-        image = RegionSplatRenderer()(field, labels)
-        for other in (pickle.loads(pickle.dumps(field)), copy.deepcopy(field)):
-            assert torch.equal(RegionSplatRenderer()(other, labels), image)
-
     @pytest.mark.parametrize("move", [lambda f: f.half(), lambda f: f.bfloat16(), lambda f: f.to(torch.float16)])
     def test_half_is_refused_aloud(self, field: GaussianField, move: object) -> None:
         before = field.means.detach().clone()
@@ -198,7 +176,7 @@ class TestGaussianField(BaseTester):
             field.subset(mask)
 
 
-class TestRegionSplatRenderer(BaseTester):
+class TestRegionSplatRenderer(BaseTester, without={"test_module": "TestRegionSplat compares it with its twin"}):
     def scene(self, device: torch.device, dtype: torch.dtype, labels: Tensor, count: int = 60) -> Scene:
         field = GaussianField.random(count, SIZE, regions=labels, seed=0, dtype=whole(dtype))
         return Scene(field, labels).to(device)
@@ -208,8 +186,7 @@ class TestRegionSplatRenderer(BaseTester):
         assert image.dtype == whole(dtype) and image.device.type == device.type
         assert image.isfinite().all() and image.any()
 
-    @pytest.mark.parametrize("size", [None, (10, 50)])
-    @pytest.mark.parametrize("keepdim", [True, False])
+    @pytest.mark.parametrize(("keepdim", "size"), [(True, None), (False, (10, 50))])
     @pytest.mark.parametrize("lead", [(), (1,), (2,)])
     def test_cardinality(
         self, backend: str, device: torch.device, lead: tuple[int, ...], keepdim: bool, size: tuple[int, int] | None
@@ -239,15 +216,6 @@ class TestRegionSplatRenderer(BaseTester):
         scene.field.region_ids = None
         self.assert_close(render(scene, size=(24, 108))[:, :, 1::3], render(scene), rtol=1e-4, atol=1e-5)
 
-    def test_module(self, backend: str, device: torch.device, dtype: torch.dtype, labels: Tensor) -> None:
-        """The twin of region_splat."""
-        scene = self.scene(device, dtype, labels)
-        field = scene.field
-        image = RegionSplatRenderer(cutoff=1e-3, backend=backend)(scene)
-        tensors = field.means, field.cholesky, field.colors, field.region_ids
-        twin = region_splat(*tensors, labels.to(device), cutoff=1e-3, backend=backend)
-        assert twin.any() and torch.equal(image, twin)
-
     def test_dynamo(self, backend: str, device: torch.device, dtype: torch.dtype, labels: Tensor) -> None:
         scene, render = self.scene(device, dtype, labels), RegionSplatRenderer(clamp=True, backend=backend)
         self.assert_compiles(lambda: render(scene), leaves=list(scene.parameters()), rtol=1e-4, atol=1e-5)
@@ -259,8 +227,8 @@ class TestRegionSplatRenderer(BaseTester):
         assert free.min() < 0 and free.max() > 1
         assert torch.equal(clamped, free.clamp(0, 1))
 
-    @pytest.mark.parametrize("size", [(12, 18), (7, 36), (24, 11), (1, 1), (30, 11), (23, 35)])
-    @pytest.mark.parametrize("softness", [None, 0.0, 0.8])
+    @pytest.mark.parametrize("size", [(12, 18), (1, 1), (30, 11), (23, 35)])
+    @pytest.mark.parametrize("softness", [None, 0.8])
     def test_a_smaller_image_is_the_area_mean(
         self, field: GaussianField, labels: Tensor, size: tuple[int, int], softness: float | None
     ) -> None:
@@ -299,22 +267,13 @@ class TestRegionSplatRenderer(BaseTester):
         assert RegionSplatRenderer()(GaussianField.random(0, SIZE, regions=labels), labels).eq(0).all()
 
 
-class TestComposition:
-    def test_no_grad_and_inference_mode(self, field: GaussianField, labels: Tensor) -> None:
-        render = RegionSplatRenderer()
-        expected = render(field, labels)
-        assert expected.requires_grad
-        with torch.no_grad():
-            result = render(field, labels)
-            assert torch.equal(result, expected) and not result.requires_grad
-        with torch.inference_mode():
-            assert torch.equal(render(field, labels), expected)
-        # tables made in inference mode serve a later backward
-        regions = RegionMap.from_labels(labels, 0.7)
-        with torch.inference_mode():
-            render(field, regions)
-        render(field, regions).sum().backward()
-        assert field.means.grad is not None
+def test_tables_made_in_inference_mode_serve_a_later_backward(field: GaussianField, labels: Tensor) -> None:
+    render, regions = RegionSplatRenderer(), RegionMap.from_labels(labels, 0.7)
+    with torch.inference_mode():
+        image = render(field, regions)
+    assert not image.requires_grad and torch.equal(image, render(field, regions))
+    render(field, regions).sum().backward()
+    assert field.means.grad is not None
 
 
 class TestBatch:
@@ -329,10 +288,11 @@ class TestBatch:
             labels[:] = torch.tensor(ids)[torch.arange(SIZE[1]) * len(ids) // SIZE[1]]
         return maps
 
-    @pytest.mark.parametrize("form", ["tensor", "hard", "soft", "pairs", "resized"])
+    @pytest.mark.parametrize("form", ["tensor", "hard", "soft", "pairs", "each", "resized"])
     def test_is_its_images(self, maps: Tensor, backend: str, form: str) -> None:
-        softness = {"soft": 0.8, "resized": 0.8, "pairs": {(0, 4): 1.0, (9, 5): 0.5}}.get(form, 0.0)
-        regions = maps if form == "tensor" else RegionMap.from_labels(maps, softness)  # type: ignore[arg-type]
+        pairs, each = {(0, 4): 1.0, (9, 5): 0.5}, [0.7, 0.0, {(2, 9): 1.3}]  # one softness, or one for each map
+        softness = {"soft": 0.8, "resized": each, "pairs": pairs, "each": each}.get(form, 0.0)
+        regions = maps if form == "tensor" else RegionMap(maps, softness)  # type: ignore[arg-type]
         size = (40, 50) if form == "resized" else None
         parts = [GaussianField.random(30, SIZE, regions=labels, seed=k) for k, labels in enumerate(maps)]
         leaves = [torch.stack([getattr(f, name).detach() for f in parts]) for name in ("means", "cholesky", "colors")]

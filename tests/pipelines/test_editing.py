@@ -99,9 +99,8 @@ class TestEditing(BaseTester):
         assert image.dtype == scene.field.colors.dtype and image.device.type == device.type
         assert image.isfinite().all() and not torch.equal(image, scene())
 
-    @pytest.mark.parametrize("opacities", [False, True])
-    def test_cardinality(self, edit: Edit, regions: RegionMap, device: torch.device, opacities: bool) -> None:
-        scene = scene_of(regions, opacities).to(device)
+    def test_cardinality(self, edit: Edit, regions: RegionMap, device: torch.device) -> None:
+        scene = scene_of(regions, opacities=True).to(device)
         edited = edit(scene)
         assert edited.size == SIZE and edited().shape == (3, *SIZE) and edited.metadata == {"title": "shapes"}
         assert map_of(edited).size == SIZE
@@ -115,7 +114,6 @@ class TestEditing(BaseTester):
             (lambda s: move_region(s, 2, (1, 0)), ValueError, "among the 3 ids of the map, 1, 4, 9; got 2"),
             (lambda s: move_region(s, BOX, (0.5, 0)), ValueError, "whole multiples of 1 pixel"),
             (lambda s: move_region(s, BOX, (float("nan"), 0)), ValueError, "offset must be finite; got nan"),
-            (lambda s: move_region(s, BOX, 5), TypeError, r"offset must be \(dx, dy\) in pixels; got 5"),
             (lambda s: move_region(s, BOX, (1,)), ValueError, r"offset must be \(dx, dy\)"),
             (lambda s: delete_region(s, [BOX, DISC, GROUND]), ValueError, "leave a region .*got all 3"),
             (lambda s: delete_region(s, []), ValueError, "region_ids must hold an id"),
@@ -123,22 +121,16 @@ class TestEditing(BaseTester):
             (lambda s: delete_region((s.field, s.regions), BOX), TypeError, "scene must be a Scene; got tuple"),
             (lambda s: delete_region(Scene(s.field), BOX), ValueError, "scene must have a label map"),
             (lambda s: recolor_region(grey(), BOX, 0.5), ValueError, "scene must have region ids; call scene.field"),
-            (lambda s: recolor_region(s.field, BOX, 0.5), TypeError, "scene must be a Scene; got GaussianField"),
             (lambda s: recolor_region(s, 77, 0.5), ValueError, r"ids of the Gaussians, 1, 4, 9; got 77"),
             (lambda s: recolor_region(s, BOX, torch.ones(2)), ValueError, r"gain must have shape .*got \(2,\)"),
             (lambda s: recolor_region(s, BOX, "red"), TypeError, "gain must be a number"),
             (lambda s: recolor_region(s, BOX, [1.0, "a", 0.0]), TypeError, "gain must hold numbers; got"),
             (lambda s: recolor_region(s, BOX, 1.0, torch.eye(3)), ValueError, "bias must have shape"),
-            (
-                lambda s: recolor_region(s, BOX),
-                ValueError,
-                "color must be given, or gain or bias; got both or neither",
-            ),
+            (lambda s: recolor_region(s, BOX), ValueError, "color must be given, .*; got both or neither"),
             (lambda s: recolor_region(s, BOX, 1.0, color="red"), ValueError, "got both or neither"),
             (lambda s: recolor_region(s, BOX, 1.0, strength=0.5), ValueError, "strength must be None without color"),
             (lambda s: recolor_region(s, BOX, color="reddish"), ValueError, "color must be a name such as red"),
             (lambda s: recolor_region(s, BOX, color=[1.0, 0.0]), ValueError, r"color must have shape \(3,\)"),
-            (lambda s: recolor_region(Scene(s.field), BOX, color="red"), ValueError, "scene must have a label map"),
             (
                 lambda s: recolor_region(Scene(s.field, torch.full_like(s.regions.labels, GROUND)), BOX, color="red"),
                 ValueError,
@@ -149,7 +141,6 @@ class TestEditing(BaseTester):
             (lambda s: render_region(Scene(GaussianField.random(3, SIZE), s.regions), BOX), ValueError, "region ids"),
             (lambda s: render_region(Scene(s.field, shapes().expand(2, -1, -1)), BOX), ValueError, "hold 1 map"),
             (lambda s: render_over(s, BOX, torch.zeros(1, 4, 4)), ValueError, r"shape \(3, H, W\)"),
-            (lambda s: render_over(s, [3], torch.zeros(3, 4, 4)), ValueError, "ids of the map, 1, 4, 9; got 3"),
             (lambda s: replace_background(s, BOX, torch.zeros(3, 4, 4)), TypeError, "background must be a Scene"),
             (lambda s: replace_background(s, BOX, grey()), ValueError, "background must have 3 channels; got 1"),
         ],
@@ -181,10 +172,9 @@ class TestEditing(BaseTester):
         assert all(torch.equal(a, b) for a, b in zip(scene.field.parameters(), before[1], strict=True))
         assert torch.equal(scene(), before[0]) and torch.equal(regions.labels, before[2])
 
-    @pytest.mark.parametrize("name", MAPS)
-    def test_gradcheck(self, name: str) -> None:
+    def test_gradcheck(self) -> None:
         """Of what renders regions, by the Gaussians and by the background."""
-        scene = scene_of(MAPS[name]())
+        scene = scene_of(MAPS["pairs"]())
         few = scene.field.subset(torch.cat([(ids_of(scene) == r).nonzero().flatten()[:2] for r in (BOX, DISC, GROUND)]))
         background = torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(1))
 
@@ -268,7 +258,7 @@ class TestExtract:
 
 
 class TestMove:
-    @pytest.mark.parametrize("offset", [(-5, -3), (-7, 6), (0, 0)])
+    @pytest.mark.parametrize("offset", [(-7, 6), (0, 0)])
     def test_cut_out_is_shifted(self, regions: RegionMap, offset: tuple[int, int]) -> None:
         scene = scene_of(regions)
         before = cut(scene, BOX)
@@ -313,9 +303,10 @@ def luma(scene: Scene) -> Tensor:
 
 
 class TestRecolor:
-    @pytest.mark.parametrize("opacities", [False, True])
     @pytest.mark.parametrize(
-        "gain", [0.5, torch.tensor([1.5, 0.0, 1.0]), torch.linspace(0, 1, 9).view(3, 3)], ids=["1", "C", "CxC"]
+        ("gain", "opacities"),
+        [(0.5, False), (torch.tensor([1.5, 0.0, 1.0]), True), (torch.linspace(0, 1, 9).view(3, 3), False)],
+        ids=["1", "C", "CxC"],
     )
     def test_image_changes_by_the_formula(self, regions: RegionMap, gain: Tensor | float, opacities: bool) -> None:
         scene, bias = scene_of(regions, opacities), torch.tensor([0.2, 0.0, -0.1])
@@ -375,11 +366,6 @@ class TestRecolor:
         for strength, options in ((0.75, {}), (0.2, {"strength": 0.2}), (0.0, {"strength": 0.0})):
             mixed = recolor_region(scene, BOX, color="red", **options)().detach()
             torch.testing.assert_close(mixed, before.lerp(whole, strength), rtol=0, atol=2e-5)
-
-    def test_without_bias_no_gaussian_is_added(self) -> None:
-        scene = scene_of(MAPS["hard"]())
-        again = recolor_region(scene, BOX, 1.0)
-        assert again.num_gaussians == scene.num_gaussians and torch.equal(again.field.colors, scene.field.colors)
 
 
 class TestDelete:

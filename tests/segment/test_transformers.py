@@ -11,7 +11,6 @@ import torch
 from torch import nn
 
 from kcgs.segment import segment, segment_with_scores
-from kcgs.segment.methods.dino import patch_features
 from kcgs.segment.methods.sam import suppress_duplicates
 from tests.segment.checks import assert_segmentation, split_image
 
@@ -126,15 +125,13 @@ BOX = [10, 10, 40, 30]
 PROMPTS = ["a dog", "the grass", "god"]
 SMALL_DINO = {"longer_side": 112, "num_clusters": 3}
 CASES = [
-    *(("dino", model, options, None) for model in DINOS for options in (SMALL_DINO, SMALL_DINO | {"max_regions": 2})),
+    *(("dino", model, SMALL_DINO | {"max_regions": 2}, None) for model in DINOS),
     ("dino", "dinov2", {"longer_side": 64, "num_clusters": 1}, 1),
     ("dino", "color-dino", {"longer_side": 120, "num_clusters": 2}, 2),
     *(
         ("sam", model, options, count)
         for model in SAMS
         for options, count in (
-            ({"box": BOX}, None),
-            ({"foreground": [[20, 20], [50, 38]]}, None),
             ({"foreground": [[20, 20]], "background": [[50, 38]]}, None),
             ({"box": torch.tensor(BOX), "foreground": torch.tensor([[20, 20]])}, None),
             ({"grid": 2, "min_score": 0.0, "max_regions": 5, "min_size": 4}, None),
@@ -175,11 +172,8 @@ class TestSegment:
     def test_a_prompt_asks_for_an_object(self, folder: Folder, model: str) -> None:
         names = segment_with_scores(IMAGE, "sam", model=folder(model), box=BOX, min_size=1).names
         assert names is not None and set(names.values()) == {"object", "background"}
-        assert segment_with_scores(IMAGE, "sam", model=folder(model), grid=1).names is None
-
-    def test_masks_that_no_mask_covers_have_no_score(self, folder: Folder) -> None:
-        scores = segment_with_scores(IMAGE, "sam", model=folder("sam"), grid=1, min_score=1.0).scores
-        assert scores is not None and scores.isnan().all()
+        whole = segment_with_scores(IMAGE, "sam", model=folder(model), grid=1, min_score=1.0)  # that no mask covers
+        assert whole.names is None and whole.scores is not None and whole.scores.isnan().all()
 
     def test_names_are_prompts(self, folder: Folder) -> None:
         def names(**options: Any) -> set[str]:
@@ -213,8 +207,13 @@ class TestSegment:
         with pytest.raises((TypeError, ValueError), match=message):
             segment(IMAGE, method, model=model, **options)
 
-    @pytest.mark.parametrize(("method", "model"), [("dino", "dino"), ("sam", "sam2"), ("text", "clipseg")])
-    @pytest.mark.parametrize("damage", ["no weights", "truncated", "of another model", "no files"])
+    @pytest.mark.parametrize(
+        ("method", "model", "damage"),
+        [
+            *(("dino", "dino", damage) for damage in ("no weights", "truncated", "of another model", "no files")),
+            *((method, model, "truncated") for method, model in (("sam", "sam2"), ("text", "clipseg"))),
+        ],
+    )
     def test_bad_model(self, tmp_path: Path, folder: Folder, method: str, model: str, damage: str) -> None:
         from safetensors.torch import save_file
 
@@ -231,21 +230,11 @@ class TestSegment:
             segment(IMAGE, method, model=tmp_path, **options)
 
 
-class TestPatchFeatures:
-    @pytest.mark.parametrize("name", DINOS)
-    def test_shape(self, folder: Folder, name: str) -> None:
-        model = transformers.AutoModel.from_pretrained(folder(name))
-        patch = model.config.patch_size
-        assert patch_features(IMAGE, model, 8 * patch).shape == (round(40 / 60 * 8), 8, 24)
-        assert patch_features(IMAGE, folder(name), patch).shape == (1, 1, 24)
-
-    def test_no_patches(self) -> None:
-        sizes = {"vocab_size": 5, "hidden_size": 8, "intermediate_size": 8}
-        model = transformers.CLIPTextModel(
-            transformers.CLIPTextConfig(**sizes, num_hidden_layers=1, num_attention_heads=1)
-        )
-        with pytest.raises(ValueError, match="must be a vision transformer with patches; got CLIPTextModel"):
-            segment(IMAGE, "dino", model=model)
+def test_no_patches() -> None:
+    sizes = {"vocab_size": 5, "hidden_size": 8, "intermediate_size": 8}
+    model = transformers.CLIPTextModel(transformers.CLIPTextConfig(**sizes, num_hidden_layers=1, num_attention_heads=1))
+    with pytest.raises(ValueError, match="must be a vision transformer with patches; got CLIPTextModel"):
+        segment(IMAGE, "dino", model=model)
 
 
 def test_suppress_duplicates() -> None:

@@ -40,11 +40,11 @@ class TestVideoFiles:
         assert video.frame_rate == pytest.approx(30000 / 1001, abs=0.01)
         assert read_video(tmp_path / name, frame_rate=12.5).frame_rate == 12.5
         middles = [(2 * k + 1) * width // 12 for k in range(6)]
-        for _ in range(2):
-            copies = torch.stack(list(video))
-            assert copies.shape == frames.shape and copies.dtype == torch.float32
-            assert (copies - frames).abs().mean() < 0.01
-            assert (copies - frames)[:, :, ::8, middles].abs().max() < 2.5 / 255
+        copies = torch.stack(list(video))
+        assert torch.equal(torch.stack(list(video)), copies)
+        assert copies.shape == frames.shape and copies.dtype == torch.float32
+        assert (copies - frames).abs().mean() < 0.01
+        assert (copies - frames)[:, :, ::8, middles].abs().max() < 2.5 / 255
         assert os.listdir(tmp_path) == [name]
 
     def test_stream(self, tmp_path: Path, av: Any) -> None:
@@ -72,7 +72,7 @@ class TestVideoFiles:
         assert video.size == tuple(upright.shape[2:])
         assert (torch.stack(list(video)) - upright).abs().mean() < 0.01
 
-    @pytest.mark.parametrize("share", [0.0, 0.3, 0.95])
+    @pytest.mark.parametrize("share", [0.0, 0.95])
     def test_damaged(self, tmp_path: Path, share: float) -> None:
         write_video(tmp_path / "a.mp4", torch.rand(30, 3, 32, 48), 24)
         data = (tmp_path / "a.mp4").read_bytes()
