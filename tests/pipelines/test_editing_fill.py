@@ -189,3 +189,13 @@ def test_no_step_lowers_the_cost_of_a_choice_of_two(seed: int) -> None:
     bits = product((0, 1), repeat=6)
     choices = [torch.zeros(4, 5, dtype=torch.int64).masked_scatter(hole, torch.tensor(choice)) for choice in bits]
     assert cost(choose_layers(layers, costs, hole)) == pytest.approx(min(map(cost, choices)), abs=1e-3)
+
+
+def test_hole_without_a_match_is_smooth() -> None:
+    """Every place differs from the surroundings of the hole, or reaches beyond the image."""
+    image = torch.full((3, 40, 60), 0.1)
+    image[:, :, 30:] = 0.9
+    hole = torch.zeros(40, 60).bool()
+    hole[4:36, 4:56] = True
+    difference = inpaint_from_matches(image, hole) - inpaint(image, hole)
+    assert difference.abs().max() < 0.05
