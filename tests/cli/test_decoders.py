@@ -75,11 +75,7 @@ class TestExport:
         ("arguments", "code", "words"),
         [
             (("scene.safetensors", "-o", "a.txt"), 2, "must end in .onnx or .html; got 'a.txt'"),
-            (
-                ("scene.safetensors", "-o", "a.html", "--interactive"),
-                2,
-                "'--interactive': must be left out with a page",
-            ),
+            (("scene.safetensors", "-o", "a.html", "--interactive"), 2, "'--interactive': must be left out with a"),
             (("truncated.safetensors", "-o", "a.onnx"), 1, "kcgs: "),
         ],
     )

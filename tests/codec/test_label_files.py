@@ -17,7 +17,6 @@ from torch import Tensor
 
 from kcgs.cli import main
 from kcgs.codec import decode_labels, encode_labels
-from kcgs.codec.label_files import turned, turned_back
 from kcgs.codec.labels import pixels
 from kcgs.data import load_labels, save_labels
 
@@ -35,7 +34,7 @@ def roundtrip(labels: Any) -> bytes:
 
 
 class TestEncodeLabels:
-    @settings(max_examples=60)
+    @settings(max_examples=40)
     @given(st.data())
     def test_roundtrip(self, data: st.DataObject) -> None:
         height, width = data.draw(st.integers(1, 24)), data.draw(st.integers(1, 24))
@@ -46,11 +45,11 @@ class TestEncodeLabels:
         roundtrip(np.kron(coarse, np.ones((scale, scale), np.int64))[:height, :width])
 
     @pytest.mark.parametrize("dtype", DTYPES)
-    @pytest.mark.parametrize("size", [(1, 1), (1, 300), (300, 1), (9, 8)])
-    def test_types_and_sizes(self, size: tuple[int, int], dtype: torch.dtype) -> None:
+    def test_types_and_sizes(self, dtype: torch.dtype) -> None:
         highest = 1 if dtype == torch.bool else min(torch.iinfo(dtype).max, 1 << 62)
-        labels = np.random.default_rng(0).choice([0, highest // 2, highest], size)
-        roundtrip(torch.from_numpy(labels).to(dtype))
+        for size in ((1, 1), (1, 300), (300, 1), (9, 8)):
+            labels = np.random.default_rng(0).choice([0, highest // 2, highest], size)
+            roundtrip(torch.from_numpy(labels).to(dtype))
 
     def test_numpy_arrays(self) -> None:
         array = make_labels(1).astype(np.uint16)
@@ -88,12 +87,6 @@ class TestEncodeLabels:
         labels = make_labels(0, count=9)
         order = np.random.RandomState(0).permutation(9)
         assert len(encode_labels(order[labels])) <= len(encode_labels(labels)) + 9
-
-    @pytest.mark.parametrize(("turn", "corner"), [*enumerate([0, 2, 3, 5, 0, 3, 2, 5])])
-    def test_turns(self, turn: int, corner: int) -> None:
-        labels = np.arange(6).reshape(2, 3)
-        assert np.array_equal(turned_back(turned(labels, turn), turn), labels)
-        assert turned(labels, turn)[0, 0] == corner
 
     @pytest.mark.parametrize("limit", ["MAX_CODED", "MAX_ESCAPES"])
     def test_work_is_bounded(self, limit: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -285,7 +285,7 @@ CASES = {
     # the place of its only start is a number of more than 65536
     "long row": np.eye(1, 66000, 65900),
     # what is above the map, and to its right, decides much here
-    **{f"low {seed}": cells(1 + seed % 4, 40, 9, seed, noise=0.02) for seed in range(12)},
+    **{f"low {seed}": cells(1 + seed % 4, 40, 9, seed, noise=0.02) for seed in range(4)},
 }
 
 
@@ -300,7 +300,7 @@ class TestLabels:
 
 
 @pytest.mark.parametrize("ids", [[0, 255], [255, 0], [0, 1], [1, 0], [7, 9], [0, 3, 2, 1, 5], [9, 1, 200, 3, 254]])
-@pytest.mark.parametrize("kind", ["uint8", "uint16", "int32"])
+@pytest.mark.parametrize("kind", ["uint8", "int32"])
 def test_ids_of_files(ids: list[int], kind: str) -> None:
     labels = np.array(ids, kind)[cells(20, 30, len(ids))]
     assert read_file(encode_labels(labels)) == (kind, labels.tolist())

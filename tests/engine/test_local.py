@@ -25,7 +25,7 @@ def tasks(count: int, folder: Path) -> list[Any]:
     return [import_module("engine_tasks").Task(number, folder) for number in range(count)]
 
 
-@pytest.mark.parametrize("workers", [None, 1, 2])
+@pytest.mark.parametrize("workers", [None, 2])
 class TestBoth:
     def test_results_and_threads(self, tmp_path: Path, workers: int | None) -> None:
         before = torch.get_num_threads()

@@ -132,7 +132,7 @@ class TestConformance:
     def test_scenes(self, node: Node, seeds: range) -> None:
         check_scenes(node, seeds)
 
-    @pytest.mark.parametrize("size", [(1, 550_000), (550_000, 1), (550, 1000), (3, 2000)])
+    @pytest.mark.parametrize("size", [(1, 550_000), (550_000, 1), (550, 1000)])
     def test_many_cells(self, node: Node, size: tuple[int, int]) -> None:
         count, generator = 34_500, torch.Generator().manual_seed(0)
         means = torch.rand(2, count, 2, generator=generator).prod(0) * torch.tensor(size[::-1])
@@ -149,7 +149,7 @@ class TestConformance:
 
 
 class TestDamage:
-    @pytest.mark.parametrize(("count", "seed"), [(60, 0), pytest.param(2000, 1000, marks=pytest.mark.slow)])
+    @pytest.mark.parametrize(("count", "seed"), [(40, 0), pytest.param(2000, 1000, marks=pytest.mark.slow)])
     def test_damaged_files(self, node: Node, count: int, seed: int) -> None:
         attack(node, count, seed)
 

@@ -33,8 +33,10 @@ def uninterrupted() -> dict[str, FitResult]:
 
 class TestCheckpoint:
     @pytest.mark.usefixtures("clock")  # it says when the file is written
-    @pytest.mark.parametrize("recipe", RECIPES)
-    @pytest.mark.parametrize("killed_at", [1, 47, 75, 119])
+    @pytest.mark.parametrize(
+        ("recipe", "killed_at"),
+        [("best", 1), ("best", 47), ("best", 75), ("best", 119), ("best-baseline", 75), ("paper", 47)],
+    )
     def test_resumed_is_uninterrupted(
         self, tmp_path: Path, uninterrupted: dict[str, FitResult], recipe: str, killed_at: int
     ) -> None:
@@ -92,7 +94,7 @@ class TestCheckpoint:
         file, rng = tmp_path / "state", random.Random(0)
         fit(image, labels, 30, recipe=quick(iterations=3), checkpoint=file)
         content, cases = file.read_bytes(), [b"", b"nothing of the kind"]
-        for count in (0, 1, 2, 3) * 25:  # flipped bits; 0: a cut
+        for count in (0, 1, 2, 3) * 8:  # flipped bits; 0: a cut
             damaged = bytearray(content if count else content[: rng.randrange(len(content))])
             for bit in rng.sample(range(8 * len(content)), count):
                 damaged[bit // 8] ^= 1 << bit % 8
