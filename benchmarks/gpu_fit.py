@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
 from statistics import fmean
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
-from kcgs import FitConfig, FitResult, Scene, fit
+from kcgs import FitConfig, fit
 from kcgs.functional import ef_psnr, psnr
 from kcgs.rate import fit_bytes
 
@@ -28,6 +28,8 @@ from .core.fits import QUICK_ITERATIONS
 from .core.goals import Goal, goals_table, missed_goals
 from .core.images import FRAMES, choose, load
 from .core.run import Job, Options, Page, Row
+
+Result = TypeVar("Result")
 
 GPU, CORES, OTHER = "best, GPU", "best, cores", "gaussian-image, GPU"
 FILE_GPU, FILE_CORES = "file, GPU", "file, cores"
@@ -63,8 +65,6 @@ call of `fit`, image and mask on the device, the GPU waited for; a short fit of 
 in them. *GPU* is a GPU, *cores* all cores beside it. `gaussian-image` has {METHODS[OTHER][1]["iterations"]:,}
 iterations, a tenth of its own. *new process* is the first fit of a process, *new machine* that with empty caches of
 compiled code; *next* is the second fit of that process, and *process seconds* begin before Python starts."""
-
-
 # where files were measured
 METHOD_OF_FILES = f"""*file* is `fit_bytes` without a mask, in {FILE_BYTES:,} bytes for PSNR; its PSNR is that of the
 decoded scene."""
@@ -81,33 +81,26 @@ def config_of(method: str, quick: bool) -> FitConfig:
     return FitConfig.from_recipe(recipe, **{**settings, **({"iterations": QUICK_ITERATIONS} if quick else {})})
 
 
+def shorten(config: FitConfig) -> FitConfig:
+    """Return the settings of a fit that compiles all programs."""
+    return config.model_copy(update={"iterations": min(WARM_UP_ITERATIONS, config.planned_iterations)})
+
+
 @cache
 def warm_up(config: FitConfig, n: int, size: tuple[int, int], has_labels: bool, device: str) -> None:
     """Fit noise of this size, so that everything is compiled."""
     noise = torch.rand(3, *size, generator=torch.Generator().manual_seed(0)).to(device)
     labels = (noise[0].cumsum(1) > size[1] / 4).long() if has_labels else None
-    short = config.model_copy(update={"iterations": min(WARM_UP_ITERATIONS, config.planned_iterations)})
-    finish(lambda: fit(noise, labels, n, recipe=short))
+    finish(lambda: fit(noise, labels, n, recipe=shorten(config)))
 
 
-def timed_fit(image: Tensor, labels: Tensor | None, n: int, config: FitConfig) -> tuple[FitResult, float]:
-    """Fit an image, and return the result and the seconds."""
+def timed(action: Callable[[], Result]) -> tuple[Result, float]:
+    """Return the result of an action and its seconds."""
     synchronize()
     start = time.perf_counter()
-    result = fit(image, labels, n, recipe=config)
+    result = action()
     synchronize()
     return result, time.perf_counter() - start
-
-
-def timed_file(image: Tensor, config: FitConfig, quick: bool) -> tuple[Scene, int, float]:
-    """Fit an image to a file, and return the decoded scene, the iterations of the fit and the seconds."""
-    target_bytes = QUICK_FILE_BYTES if quick else FILE_BYTES
-    short = config.model_copy(update={"iterations": min(WARM_UP_ITERATIONS, config.planned_iterations)})
-    finish(lambda: fit_bytes(image, None, target_bytes, recipe=short))
-    start = time.perf_counter()
-    _, scene, result = fit_bytes(image, None, target_bytes, recipe=config)
-    synchronize()
-    return scene, result.history[-1].iteration, time.perf_counter() - start
 
 
 def load_to(device: str, image: str, data: str, quick: bool) -> tuple[Tensor, Tensor | None]:
@@ -118,7 +111,8 @@ def load_to(device: str, image: str, data: str, quick: bool) -> tuple[Tensor, Te
 
 def fit_in_process(image: str, n: int, method: str, device: str, data: str, quick: bool) -> float:
     """Fit an image, and return only the seconds, which another process can receive."""
-    return timed_fit(*load_to(device, image, data, quick), n, config_of(method, quick))[1]
+    pixels, labels = load_to(device, image, data, quick)
+    return timed(lambda: fit(pixels, labels, n, recipe=config_of(method, quick)))[1]
 
 
 @contextmanager
@@ -157,13 +151,15 @@ def measure(image: str, n: int | None, method: str, device: str, data: str, quic
     config = config_of(method, quick)
     with threads(os.cpu_count() or 1):
         if n is None:
-            scene, iterations, seconds = timed_file(pixels, config, quick)
+            target_bytes = QUICK_FILE_BYTES if quick else FILE_BYTES
+            finish(lambda: fit_bytes(pixels, None, target_bytes, recipe=shorten(config)))
+            (_, scene, result), seconds = timed(lambda: fit_bytes(pixels, None, target_bytes, recipe=config))
         else:
             warm_up(config, n, (pixels.shape[1], pixels.shape[2]), labels is not None, device)
-            result, seconds = timed_fit(pixels, labels, n, config)
-            scene, iterations = result.scene, result.history[-1].iteration
+            result, seconds = timed(lambda: fit(pixels, labels, n, recipe=config))
+            scene = result.scene
     render = scene.render()
-    row |= {"seconds": seconds, "iterations": iterations, "psnr": float(psnr(render, pixels))}
+    row |= {"seconds": seconds, "iterations": result.history[-1].iteration, "psnr": float(psnr(render, pixels))}
     return [row | ({} if labels is None else {"ef_psnr": float(ef_psnr(render, pixels, labels))})]
 
 

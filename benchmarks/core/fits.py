@@ -33,7 +33,7 @@ Method = tuple[str, dict[str, Any]]
 # that are compared in as much time
 METHODS: dict[str, Method] = {
     **{name: (name, {}) for name in ("best", "best-baseline", "paper", "gaussian-image", "gaussian-image-clamp")},
-    # SSIM in torch takes ten times as long as all else: with it there would be a tenth of the iterations
+    # SSIM in torch takes ten times as long as all else
     "image-gs, L1 alone": ("best", {**image_gs.SETTINGS, "objective": "l1"}),
 }
 
