@@ -204,6 +204,7 @@ class TestFailures:
             (("fit", "photo.png", "-n", "0"), 2, "greater than or equal to 1"),
             (("fit", "photo.png", "-n", "10000"), 2, "must be at most 2400, the pixels of the 60 x 40 image"),
             (("fit", "photo.png", "--objective", "visual"), 2, "one of l2, l1, ms-ssim; got 'visual'"),
+            (("fit", "photo.png", "--objective", "psnr"), 2, "got 'psnr', which is now 'l2'"),
             (("fit", "nothing.png"), 2, "nothing.png"),
             (("fit", "text.png"), 1, "text.png"),
             (("fit", "photo.png", "--recipe", "none-such"), 2, "'--recipe': must be one of"),

@@ -82,6 +82,11 @@ class TestDecode:
         code, _, err = kcgs("decode", "a.kcgs", "-o", "a.png")
         assert code == 0 and err.startswith("warning: a.kcgs ends after ")
 
+    def test_damage(self, kcgs: Kcgs) -> None:
+        Path("a.kcgs").write_bytes(b"kcgs\1 and so on")
+        code, _, err = kcgs("decode", "a.kcgs", "-o", "a.png")
+        assert code == 1 and err.startswith("kcgs: ") and not Path("a.png").exists()
+
 
 def test_other_commands_take_a_file(kcgs: Kcgs) -> None:
     kcgs("encode", "scene.safetensors", "-o", "a.kcgs")
