@@ -37,6 +37,28 @@ def test_videos_are_read() -> None:
 
 
 @pytest.mark.parametrize(
+    ("file", "recipe", "guided"), [("fit", "best", True), ("gaussian-image", "gaussian-image", False)]
+)
+def test_checkpoints_are_continued(tmp_path: Path, file: str, recipe: str, guided: bool) -> None:
+    """The files are of fits that were killed after 60 of 100 iterations."""
+    y, x = torch.meshgrid(torch.arange(24.0), torch.arange(32.0), indexing="ij")
+    labels = ((x - 14) ** 2 + (y - 11) ** 2 < 64).long()
+    image = (torch.stack([0.8 * labels + 0.1, x / 40, y / 30]) * 255).round() / 255
+    path = tmp_path / "state"
+    path.write_bytes((FILES / f"{file}.state").read_bytes())
+    arguments: dict[str, Any] = {"recipe": recipe, "iterations": 100, "checkpoint": path, "resume": True}
+    with pytest.raises(ValueError, match="belongs to another fit"):
+        fit(image, labels if guided else None, 41, **arguments)
+    seen: list[int] = []
+    resumed = fit(image, labels if guided else None, 40, on_step=lambda i, _: seen.append(i), **arguments)
+    whole = fit(image, labels if guided else None, 40, recipe=recipe, iterations=100)
+    assert seen == [*range(61, 101)]
+    assert [entry.iteration for entry in resumed.history] == [entry.iteration for entry in whole.history]
+    # the fits up to 60 have the same bits only on machines of one kind
+    assert resumed.psnr == pytest.approx(whole.psnr, abs=0.5)
+
+
+@pytest.mark.parametrize(
     ("call", "replacement"),
     [
         (lambda: fit(IMAGE, objective="psnr"), "'l2'"),

@@ -18,6 +18,7 @@ from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
 from .best import Best
+from .checkpoint_0_3 import from_0_3, problems_of_0_3
 from .problem import Problem
 from .result import HistoryEntry
 from .start import make_state
@@ -45,9 +46,8 @@ class Checkpoint:
         """Replace the file by the state, and the seconds of the fit so far."""
         start = time.perf_counter()
         buffer = io.BytesIO()
-        torch.save(
-            {"version": _VERSION, "problem": _fingerprint(self.problem), "seconds": seconds, **_to_plain(state)}, buffer
-        )
+        fingerprint = _fingerprint(self.problem, _text(self.problem))
+        torch.save({"version": _VERSION, "problem": fingerprint, "seconds": seconds, **_to_plain(state)}, buffer)
         content = buffer.getvalue()
         write_file(self.path, hashlib.sha256(content).digest() + content)
         end = time.perf_counter()
@@ -60,21 +60,28 @@ class Checkpoint:
         if hashlib.sha256(content).digest() != digest:
             raise ValueError(f"checkpoint {str(self.path)!r} is damaged, or no checkpoint of a fit")
         plain = torch.load(io.BytesIO(content), self.problem.device, weights_only=True)
-        if plain.get("version") != _VERSION:
+        is_of_0_3 = "best_value" in plain
+        if not is_of_0_3 and plain.get("version") != _VERSION:
             raise ValueError(f"checkpoint {str(self.path)!r} is of another version of kcgs: remove it, and fit anew")
-        if plain["problem"] != _fingerprint(self.problem):
+        texts = problems_of_0_3(self.problem) if is_of_0_3 else [_text(self.problem)]
+        if plain["problem"] not in [_fingerprint(self.problem, text) for text in texts]:
             raise ValueError(
                 f"checkpoint {str(self.path)!r} belongs to another fit: image, regions, settings, num_gaussians and "
                 "seed must be those it was written with"
             )
+        if is_of_0_3:
+            plain = from_0_3(plain, self.problem)
         return _from_plain(plain, self.problem), plain["seconds"]
 
 
-def _fingerprint(problem: Problem) -> str:
+def _text(problem: Problem) -> str:
     # a resumed fit may get more time
     settings = problem.config.model_dump_json(exclude={"max_seconds"})
-    numbers = f"{settings} {problem.num_gaussians} {problem.seed} {tuple(problem.target.shape)}"
-    digest = hashlib.sha256(numbers.encode())
+    return f"{settings} {problem.num_gaussians} {problem.seed} {tuple(problem.target.shape)}"
+
+
+def _fingerprint(problem: Problem, text: str) -> str:
+    digest = hashlib.sha256(text.encode())
     digest.update(problem.target.cpu().numpy().tobytes())
     if problem.regions is not None:
         digest.update(repr(problem.regions.softness).encode())

@@ -132,6 +132,12 @@ class GaussianAdam(Optimizer):
         # unwrapped: torch's decorator, which keeps it out of torch.compile, imports the compiler, which takes 1 to 3 s
         unwrap(Optimizer.add_param_group)(self, param_group)
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take the state of a dict; torch calls this in `load_state_dict`."""
+        super().__setstate__(state)
+        for group in self.param_groups:
+            group.setdefault("bounded", False)  # a setting that version 0.3 did not have
+
     @torch.no_grad()
     def append(self, field: GaussianField, added: GaussianField) -> None:
         """Add Gaussians to one of the optimizer's fields; the averages of the field's present Gaussians stay.
