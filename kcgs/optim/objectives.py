@@ -161,7 +161,8 @@ class LossObjective(Objective):
         if self.image is not None:
             return Residual(self.image - render)
         slope = self.slope(render)
-        steps = [slope * (-(0.5**k) / slope.abs().max()) for k in range(_NUM_STEPS)]
+        largest = slope.abs().max().clamp_min(torch.finfo(slope.dtype).tiny)  # a slope of 0 gives steps of 0
+        steps = [slope * (-(0.5**k) / largest) for k in range(_NUM_STEPS)]
         return Residual(min(steps, key=lambda step: float(self.value(render + step))))
 
     @staticmethod

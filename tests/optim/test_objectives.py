@@ -69,6 +69,9 @@ class TestLoss:
         assert float(error.abs().max()) == pytest.approx(2.0 ** round(math.log2(float(error.abs().max()))))
         assert objective.value(RENDER + error) < objective.value(RENDER)
 
+    def test_a_slope_of_zero_leaves_no_residual(self) -> None:
+        assert torch.equal(LossObjective(lambda render: 0.0 * render.sum()).residual(RENDER).error, 0.0 * RENDER)
+
     def test_what_is_no_loss_is_refused(self) -> None:
         for loss, words in (
             (lambda render: render, r"a function that returns a scalar tensor; got shape \(3, 24, 40\)"),
