@@ -173,13 +173,17 @@ def _gradient(parameter: Tensor) -> Tensor:
     return torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
 
 
+def state_shapes(group: dict[str, Any]) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the averages of a group, (..., N, K), by name; each row has an age of its own."""
+    first, *others = group["params"]
+    columns = 5 if group["kind"] == "geometry" else first.shape[-1] + len(others)
+    return {name: (*first.shape[:-1], width) for name, width in (("age", 1), ("average", columns), ("square", columns))}
+
+
 def init_state(state: dict[str, Tensor], group: dict[str, Any]) -> None:
-    """Make the averages of a group (..., N, K), if there are none; each row has an age of its own."""
+    """Make the averages of a group, if there are none."""
     if not state:
-        first, *others = group["params"]
-        columns = 5 if group["kind"] == "geometry" else first.shape[-1] + len(others)
-        for name, width in {"age": 1, "average": columns, "square": columns}.items():
-            state[name] = first.new_zeros(*first.shape[:-1], width)
+        state.update({name: group["params"][0].new_zeros(shape) for name, shape in state_shapes(group).items()})
 
 
 def _adam(state: dict[str, Tensor], gradient: Tensor, group: dict[str, Any], moving: Tensor | None) -> Tensor:
