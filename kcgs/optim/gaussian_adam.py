@@ -188,10 +188,7 @@ class GaussianAdam(Optimizer):
                 Gaussians in one image than in another.
         """
         self._group(field)
-        shapes = (field.means.shape[-2:-1], field.means.shape[:-1])
-        if mask.dtype != torch.bool or mask.shape not in shapes:
-            expected = " or ".join(f"({', '.join(map(str, shape))})" for shape in dict.fromkeys(shapes))
-            raise InvalidArgument("mask", f"boolean, {expected}", f"{mask.dtype}, {tuple(mask.shape)}")
+        _check_mask(mask, field.means.shape[-2:-1], field.means.shape[:-1])
         index = mask.nonzero()[:, -1]
         if mask.ndim == 2:
             counts = mask.sum(1)
@@ -228,9 +225,7 @@ class GaussianAdam(Optimizer):
             tensor([False,  True,  True,  True])
         """
         geometry = self._group(field)
-        expected = field.means.shape[:-1]
-        if mask.dtype != torch.bool or mask.shape != expected:
-            raise InvalidArgument("mask", f"boolean, {tuple(expected)}", f"{mask.dtype}, {tuple(mask.shape)}")
+        _check_mask(mask, field.means.shape[:-1])
         colors = next(group for group in self.param_groups if group["params"][0] is field.colors)
         for group in (geometry, colors):
             state = self.state[group["params"][0]]
@@ -268,6 +263,12 @@ def _layout(field: GaussianField) -> str:
     *batch, _, channels = field.colors.shape
     optional = [name for name in ("region_ids", "opacities") if getattr(field, name) is not None]
     return " and ".join([f"colors ({', '.join(map(str, [*batch, 'N', channels]))})", *optional])
+
+
+def _check_mask(mask: Tensor, *shapes: torch.Size) -> None:
+    if mask.dtype != torch.bool or mask.shape not in shapes:
+        expected = " or ".join(str(tuple(shape)) for shape in dict.fromkeys(shapes))
+        raise InvalidArgument("mask", f"boolean, {expected}", f"{mask.dtype}, {tuple(mask.shape)}")
 
 
 def _select_rows(table: Tensor, index: Tensor, rows: int) -> Tensor:
