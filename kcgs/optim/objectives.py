@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcgs._torch_internals import differentiate
 from kcgs.errors import InvalidArgument
 
 from .gaussians import Gaussians, Renderer
@@ -69,7 +70,7 @@ class Objective(ABC):
             with torch.enable_grad():
                 render = renderer.render(leaves)
         # `data`, since the slope may overwrite it, which the graph does not notice
-        return Gaussians(*torch.autograd.grad(render, leaves[:3], self.slope(render.data)))
+        return Gaussians(*differentiate(render, leaves[:3], self.slope(render.data)))
 
 
 class ImageObjective(Objective):

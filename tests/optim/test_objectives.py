@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -80,3 +82,17 @@ class TestLoss:
         ):
             with pytest.raises(ValueError, match=f"objective must be {words}"):
                 LossObjective(loss).slope(RENDER)
+
+
+def test_gradients_load_no_sympy() -> None:
+    """It would take 0.4 s of each process."""
+    code = """
+import sys, torch
+from kcgs import GaussianField
+from kcgs.optim import Gaussians, Renderer
+from kcgs.optim.objectives import AbsoluteError
+gaussians = Gaussians.of(GaussianField.random(3, (16, 24), seed=0))
+AbsoluteError(torch.zeros(3, 16, 24)).gradients(Renderer((16, 24)), gaussians)
+assert "sympy" not in sys.modules
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
