@@ -75,6 +75,13 @@ def is_graph_retained() -> bool:
     return bool(torch._C._autograd._get_current_graph_task_keep_graph())
 
 
+def differentiate(output: Tensor, inputs: tuple[Tensor, ...], gradient: Tensor) -> tuple[Tensor, ...]:
+    """Call `torch.autograd.grad` without its check of the gradient's shape, which loads sympy in 0.4 s."""
+    return torch.autograd.graph._engine_run_backward(
+        (output,), (gradient,), False, False, inputs, False, accumulate_grad=False
+    )
+
+
 def apply(function: Any, *arguments: Any) -> Any:
     """Apply an autograd.Function whose forward takes `ctx`, which torch refuses inside of `torch.func`.
 

@@ -26,6 +26,7 @@ TORCH = {
     "torch._C._functorch.is_legacy_batchedtensor": "torch.autograd.grad of region_splat with is_grads_batched",
     "torch.autograd.forward_ad._current_level": "forward derivatives of region_splat",
     "torch.autograd.forward_ad._set_fwd_grad_enabled": "nested forward derivatives of region_splat",
+    "torch.autograd.graph._engine_run_backward": "gradients of objectives in a fit",
     "torch._C._autograd._get_current_graph_task_keep_graph": "backward of region_splat with retain_graph",
     "torch._decomp.register_decomposition": "torch.onnx.export of a renderer",
 }

@@ -26,7 +26,7 @@ from .state import FitState
 
 # seconds between two checkpoints, per second that the first of them took to write
 _RUN_PER_WRITE = 100.0
-_VERSION = 12
+_VERSION = 13
 _DIGEST_SIZE = 32  # bytes of the SHA-256 of the content, which begins the file
 
 

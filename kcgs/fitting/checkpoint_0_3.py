@@ -45,12 +45,15 @@ def from_0_3(plain: dict[str, Any], problem: Problem) -> dict[str, Any]:
         is_draft = plain["cutoff"] != problem.config.cutoff or value == math.inf
         numbers = [torch.tensor([is_draft]), *(torch.tensor([x], dtype=torch.float64) for x in (value, psnr))]
         best = {"scene": _scene(plain["best"]), "numbers": numbers}
+    optimizer = _batched(plain["optimizer"])
+    if "parameters" in optimizer:  # of a ReparametrizedOptimizer
+        optimizer["frozen"] = None
     return {
         **{name: plain[name] for name in ("cutoff", "anchor", "history", "seconds")},
         "numbers": {name: plain[name] for name in _NUMBERS},
         "scene": _scene(plain["scene"]),
         "best": best,
-        "optimizer": _batched(plain["optimizer"]),
+        "optimizer": optimizer,
         "contour_seconds": [],
     }
 

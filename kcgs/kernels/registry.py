@@ -29,12 +29,12 @@ def resolve(backend: str, inputs: SplatInputs) -> Kernel:
 
 def warm_up(backend: str, device: torch.device, dtype: torch.dtype, channels: int) -> None:
     """Render and differentiate once, before a clock starts, since much is compiled or loaded at first use."""
-    image = _try(backend, device, dtype, channels)
+    image = _splat_once(backend, device, dtype, channels)
     leaf = image.detach().requires_grad_()
     torch.autograd.grad(leaf.sum(), leaf)  # torch, too, loads much at its first gradient
 
 
-def _try(backend: str, device: torch.device, dtype: torch.dtype, channels: int) -> Tensor:
+def _splat_once(backend: str, device: torch.device, dtype: torch.dtype, channels: int) -> Tensor:
     """Render and differentiate one Gaussian."""
     means, cholesky, colors = (torch.full((1, 1, n), 8.0, device=device, dtype=dtype) for n in (2, 3, channels))
     inputs = SplatInputs(means, cholesky, colors, None, None, (16, 16), 1e-4)
@@ -63,7 +63,7 @@ def _choose(backend: str, device: torch.device, dtype: torch.dtype) -> str:
 def _compiles(device: torch.device) -> bool:
     """Try the kernel `cuda` on a device, and warn, once, where it cannot be compiled."""
     try:
-        _try("cuda", device, torch.float32, 3)
+        _splat_once("cuda", device, torch.float32, 3)
     except Exception as error:  # whatever a compiler, a driver or a card lacks
         is_captured = torch.cuda.is_available() and torch.cuda.is_current_stream_capturing()
         if isinstance(error, torch.OutOfMemoryError) or is_captured:

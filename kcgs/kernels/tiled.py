@@ -96,7 +96,7 @@ def _tile_regions(inputs: SplatInputs) -> tuple[Tensor, Tensor, Tensor, Tensor, 
 
 def keys_of(starts: Tensor, regions: Tensor, num_regions: int) -> Tensor:
     """Return the key tile * num_regions + region of each entry; keys ascend."""
-    return torch.repeat_interleave(starts.diff()) * num_regions + regions
+    return torch.repeat_interleave(starts.diff()).long() * num_regions + regions
 
 
 def _list_pairs(inputs: SplatInputs, grid: TileGrid, keys: Tensor, num_regions: int) -> tuple[Tensor, Tensor, Tensor]:

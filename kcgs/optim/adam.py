@@ -1,4 +1,9 @@
-"""The step of Adam in each Gaussian's own frame: by compiled loops, by a Triton program, or by torch operations."""
+"""The step of Adam in each Gaussian's own frame: by torch operations, compiled loops, or a Triton program.
+
+A step takes the gradient to the frame (`frame.local_gradient`), updates Adam's averages, limits Adam's step to
+`max_step`, takes it (`frame.move`), and brings the Gaussians `within_bounds`. Colours take Adam's step as it is.
+`loops` and `cuda` have the same formulas in numba and in Triton; tests compare both with this module in float64.
+"""
 
 from __future__ import annotations
 
@@ -98,10 +103,11 @@ def _launch(state: dict[Tensor, Any], geometry: dict[str, Any], colors: dict[str
 
     gradients, adams = [], []
     for group in (geometry, colors):
-        moves, averages = _has_gradient(group), state[group["params"][0]].values()
+        moves, first = _has_gradient(group), group["params"][0]
         gradients += [_gradient(p).contiguous() if moves and p.requires_grad else None for p in group["params"]]
         # a group that does not move passes any address: it is not read
-        adams.append(Adam(*_settings(group), *(averages if moves else group["params"][:1] * 3)))
+        averages = [state[first][name] if moves else first for name in ("age", "average", "square")]
+        adams.append(Adam(*_settings(group), *averages))
     parameters = geometry["params"] + colors["params"]
     cuda.step(parameters, gradients, adams[0], adams[1], bounds_of(geometry))
     increment_version([p for p, gradient in zip(parameters, gradients, strict=True) if gradient is not None])
@@ -149,10 +155,10 @@ def _averages(state: dict[str, Tensor]) -> list[Any]:
 
 def check_gradients(gradients: list[Tensor | None]) -> None:
     """Raise a ValueError for gradients on the CPU that are not finite."""
-    given = [gradient for gradient in gradients if gradient is not None and _checks_gradients(gradient)]
-    if given and _is_compiled(*given) and is_within(given, math.inf):
+    tables = [gradient for gradient in gradients if gradient is not None and _checks_gradients(gradient)]
+    if tables and _is_compiled(*tables) and is_within(tables, math.inf):
         return
-    for gradient in given:
+    for gradient in tables:
         if not verify(gradient.isfinite().all(), "gradients must be finite"):
             count = int((~gradient.isfinite()).sum())
             cause = "the loss, or an operation between it and the render, is not finite"
@@ -173,13 +179,17 @@ def _gradient(parameter: Tensor) -> Tensor:
     return torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
 
 
+def state_shapes(group: dict[str, Any]) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the averages of a group, (..., N, K), by name; each row has an age of its own."""
+    first, *others = group["params"]
+    columns = 5 if group["kind"] == "geometry" else first.shape[-1] + len(others)
+    return {name: (*first.shape[:-1], width) for name, width in (("age", 1), ("average", columns), ("square", columns))}
+
+
 def init_state(state: dict[str, Tensor], group: dict[str, Any]) -> None:
-    """Make the averages of a group (..., N, K), if there are none; each row has an age of its own."""
+    """Make the averages of a group, if there are none."""
     if not state:
-        first, *others = group["params"]
-        columns = 5 if group["kind"] == "geometry" else first.shape[-1] + len(others)
-        for name, width in {"age": 1, "average": columns, "square": columns}.items():
-            state[name] = first.new_zeros(*first.shape[:-1], width)
+        state.update({name: group["params"][0].new_zeros(shape) for name, shape in state_shapes(group).items()})
 
 
 def _adam(state: dict[str, Tensor], gradient: Tensor, group: dict[str, Any], moving: Tensor | None) -> Tensor:
@@ -219,9 +229,9 @@ def _write(table: Tensor, values: Tensor, moving: Tensor | None) -> None:
 
 def within_bounds(means: Tensor, cholesky: Tensor, bounds: Bounds) -> tuple[Tensor, Tensor]:
     """Move centres back to the image or near it, and make Gaussians neither too thin nor larger than the image."""
-    most = bounds.max_factor
+    low, high = bounds.min_factor, bounds.max_factor
     l11, l21, l22 = cholesky.unbind(-1)
-    l11, l22, l21 = l11.clamp(bounds.min_factor, most), l22.clamp(bounds.min_factor, most), l21.clamp(-most, most)
+    l11, l21, l22 = l11.clamp(low, high), l21.clamp(-high, high), l22.clamp(low, high)
     # no tensor of the size: its copy to a device would force a host sync
     reaches = (bounds.max_outside * l11, bounds.max_outside * torch.hypot(l21, l22))
     lengths = (bounds.width, bounds.height)

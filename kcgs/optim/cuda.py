@@ -1,4 +1,4 @@
-"""The steps of `adam.py` in one launch of Triton: a thread moves a Gaussian, float32, on a CUDA device.
+"""The step of `adam.py` in one launch of Triton: a thread moves a Gaussian, float32, on a CUDA device.
 
 Intermediate numbers are float64, as in `loops.py`. A Gaussian that is frozen, by a negative age, or whose gradient is
 not finite, stays as it is.
@@ -16,7 +16,7 @@ from kcgs.kernels.cuda.triton_function import triton_function
 from .settings import Adam, Bounds
 
 # Gaussians per program
-_ROWS = 128
+_ROWS = tl.constexpr(128)
 
 
 def step(tables: list[Tensor], gradients: list[Tensor | None], geometry: Adam, colors: Adam, bounds: Bounds) -> None:
@@ -36,12 +36,12 @@ def step(tables: list[Tensor], gradients: list[Tensor | None], geometry: Adam, c
     opacities = tables[3:] or tables[:1]
     with torch.cuda.device_of(tables[0]):
         _step(
-            (-(-count // _ROWS),),
+            (-(-count // _ROWS.value),),
             *tables[:3], *opacities, *addresses[:3], *(addresses[3:] or tables[:1]), *geometry, *colors, *bounds,
             count,
             CHANNELS=channels, COLUMNS=channels + len(tables[3:]), MEANS=has_gradient[0], CHOLESKY=has_gradient[1],
             COLORS=has_gradient[2], OPACITIES=has_gradient[3], LR_LOADED=isinstance(geometry.lr, Tensor),
-            COLOR_LR_LOADED=isinstance(colors.lr, Tensor), ROWS=_ROWS,
+            COLOR_LR_LOADED=isinstance(colors.lr, Tensor),
         )  # fmt: skip
 
 
@@ -54,18 +54,27 @@ def _gradient(gradients, place, mask, EXISTS: tl.constexpr):
 
 
 @triton.jit  # type: ignore[untyped-decorator]
-def _rate(lr, beta1, beta2, age, LOADED: tl.constexpr):
-    """Return the learning rate over the first average's bias correction, and the inverse root of the second's."""
+def _count_step(ages, row, mask, lr, beta1, beta2, LOADED: tl.constexpr):
+    """Count the step of rows that are not frozen; return their mask and the two factors of their age in Adam's step.
+
+    They are the learning rate over the first average's bias correction, and the inverse root of the second's.
+    """
+    age = tl.load(ages + row, mask=mask, other=0.0) + 1.0
+    mask = mask & (age > 0.0)
+    age = tl.where(mask, age, 1.0)
+    tl.store(ages + row, age, mask=mask)
+    age = age.to(tl.float64)
     if LOADED:
         lr = tl.load(lr)
     zero = tl.zeros_like(age)
     power1, power2 = tl.exp(tl.log(beta1 + zero) * age), tl.exp(tl.log(beta2 + zero) * age)
-    return lr / (1.0 - power1), 1.0 / tl.sqrt(1.0 - power2)
+    return mask, lr / (1.0 - power1), 1.0 / tl.sqrt(1.0 - power2)
 
 
 @triton.jit
-def _move(gradient, averages, squares, place, mask, rate, root, beta1, beta2, eps):
+def _adam(gradient, place, mask, settings):
     """Update the averages of a column, and return Adam's step."""
+    averages, squares, rate, root, beta1, beta2, eps = settings
     average = tl.load(averages + place, mask=mask, other=0.0).to(tl.float64)
     square = tl.load(squares + place, mask=mask, other=0.0).to(tl.float64)
     average += (1.0 - beta1) * (gradient - average)
@@ -78,6 +87,23 @@ def _move(gradient, averages, squares, place, mask, rate, root, beta1, beta2, ep
 @triton.jit
 def _clamp(value, low, high):
     return tl.where(value < low, low, tl.where(value > high, high, value))  # NaN stays NaN
+
+
+@triton.jit
+def _widen(l11, l21, l22, min_sigma):
+    """Return the factor of `frame.widen`."""
+    xx, xy, yy, least = l11 * l11, l11 * l21, l21 * l21 + l22 * l22, min_sigma * min_sigma
+    mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
+    gap = tl.sqrt(half * half + xy * xy)
+    long = mean + gap
+    short = l11 * l22 * (l11 * l22) / long
+    new_long, new_short = tl.maximum(long, least), tl.maximum(short, least)
+    isotropic, minor = new_long - long, (new_short - short) - (new_long - long)
+    divisor = tl.where(gap > 0.0, gap, 1.0)
+    w11 = tl.sqrt(xx + isotropic + 0.5 * minor * (1.0 - half / divisor))
+    w21, w22 = (xy - 0.5 * minor * (xy / divisor)) / w11, tl.sqrt(new_long * new_short) / w11
+    is_thin = short < least
+    return tl.where(is_thin, w11, l11), tl.where(is_thin, w21, l21), tl.where(is_thin, w22, l22)
 
 
 @triton.jit
@@ -99,9 +125,10 @@ def _step(
     color_lr, color_beta1, color_beta2, color_eps, color_age, color_average, color_square,
     max_step, height, width, min_sigma, min_factor, max_outside, max_factor, count,
     CHANNELS: tl.constexpr, COLUMNS: tl.constexpr, MEANS: tl.constexpr, CHOLESKY: tl.constexpr, COLORS: tl.constexpr,
-    OPACITIES: tl.constexpr, LR_LOADED: tl.constexpr, COLOR_LR_LOADED: tl.constexpr, ROWS: tl.constexpr,
+    OPACITIES: tl.constexpr, LR_LOADED: tl.constexpr, COLOR_LR_LOADED: tl.constexpr,
 ):  # fmt: skip
-    row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
+    """Step the colours, then the geometry; the arguments are those of `step`, and a launch takes them one by one."""
+    row = tl.program_id(0).to(tl.int64) * _ROWS + tl.arange(0, _ROWS)
     mask = row < count
     gx = _gradient(means_gradient, 2 * row, mask, MEANS)
     gy = _gradient(means_gradient, 2 * row + 1, mask, MEANS)
@@ -116,19 +143,13 @@ def _step(
     mask = mask & (largest < float("inf"))
 
     if COLORS or OPACITIES:
-        steps = tl.load(color_age + row, mask=mask, other=0.0) + 1.0
-        mask = mask & (steps > 0.0)
-        steps = tl.where(mask, steps, 1.0)
-        tl.store(color_age + row, steps, mask=mask)
-        rate, root = _rate(color_lr, color_beta1, color_beta2, steps.to(tl.float64), COLOR_LR_LOADED)
+        mask, rate, root = _count_step(color_age, row, mask, color_lr, color_beta1, color_beta2, COLOR_LR_LOADED)
+        settings = color_average, color_square, rate, root, color_beta1, color_beta2, color_eps
         for k in range(COLUMNS):
             is_color = mask & (k < CHANNELS)
             gradient = _gradient(colors_gradient, row * CHANNELS + k, is_color, COLORS)
             gradient += _gradient(opacities_gradient, row, mask & (k >= CHANNELS), OPACITIES)
-            change = _move(
-                gradient, color_average, color_square, row * COLUMNS + k, mask, rate, root,
-                color_beta1, color_beta2, color_eps,
-            )  # fmt: skip
+            change = _adam(gradient, row * COLUMNS + k, mask, settings)
             if COLORS:
                 _add(colors, row * CHANNELS + k, change, is_color)
             if OPACITIES:
@@ -138,23 +159,16 @@ def _step(
         l11 = tl.load(cholesky + 3 * row, mask=mask, other=1.0).to(tl.float64)
         l21 = tl.load(cholesky + 3 * row + 1, mask=mask, other=0.0).to(tl.float64)
         l22 = tl.load(cholesky + 3 * row + 2, mask=mask, other=1.0).to(tl.float64)
-        steps = tl.load(age + row, mask=mask, other=0.0) + 1.0
-        mask = mask & (steps > 0.0)
-        steps = tl.where(mask, steps, 1.0)
-        tl.store(age + row, steps, mask=mask)
-        rate, root = _rate(lr, beta1, beta2, steps.to(tl.float64), LR_LOADED)
-        place = 5 * row
-        d1 = _move(l11 * gx + l21 * gy, average, square, place, mask, rate, root, beta1, beta2, eps)
-        d2 = _move(l22 * gy, average, square, place + 1, mask, rate, root, beta1, beta2, eps)
-        k11 = _move(l11 * g11 + l21 * g21, average, square, place + 2, mask, rate, root, beta1, beta2, eps)
-        k21 = _move(l22 * g21, average, square, place + 3, mask, rate, root, beta1, beta2, eps)
-        k22 = _move(l22 * g22, average, square, place + 4, mask, rate, root, beta1, beta2, eps)
-        d1, d2 = _clamp(d1, -max_step, max_step), _clamp(d2, -max_step, max_step)
-        k11, k21 = _clamp(k11, -max_step, max_step), _clamp(k21, -max_step, max_step)
-        k22 = _clamp(k22, -max_step, max_step)
+        mask, rate, root = _count_step(age, row, mask, lr, beta1, beta2, LR_LOADED)
+        settings = average, square, rate, root, beta1, beta2, eps
+        # frame.local_gradient
+        d1 = _clamp(_adam(l11 * gx + l21 * gy, 5 * row, mask, settings), -max_step, max_step)
+        d2 = _clamp(_adam(l22 * gy, 5 * row + 1, mask, settings), -max_step, max_step)
+        k11 = _clamp(_adam(l11 * g11 + l21 * g21, 5 * row + 2, mask, settings), -max_step, max_step)
+        k21 = _clamp(_adam(l22 * g21, 5 * row + 3, mask, settings), -max_step, max_step)
+        k22 = _clamp(_adam(l22 * g22, 5 * row + 4, mask, settings), -max_step, max_step)
+        # frame.move, then adam.within_bounds
         shift_x, shift_y = l11 * d1, l21 * d1 + l22 * d2
-
-        # L exp K, within bounds
         e1, e2, gap = tl.exp(k11), tl.exp(k22), k11 - k22
         is_small = tl.abs(gap) < 1e-4
         mean = tl.where(is_small, 0.5 * (e1 + e2), (e1 - e2) / tl.where(is_small, 1.0, gap))
@@ -167,18 +181,7 @@ def _step(
             _store(means, 2 * row, _clamp(x, -outside_x, width + outside_x), mask)
             _store(means, 2 * row + 1, _clamp(y, -outside_y, height + outside_y), mask)
         if CHOLESKY:
-            # see `frame.widen`
-            xx, xy, yy = l11 * l11, l11 * l21, l21 * l21 + l22 * l22
-            least = min_sigma * min_sigma
-            center, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
-            radius = tl.sqrt(half * half + xy * xy)
-            long = center + radius
-            short = l11 * l22 * (l11 * l22) / long
-            new_long, new_short = tl.maximum(long, least), tl.maximum(short, least)
-            isotropic, minor = new_long - long, (new_short - short) - (new_long - long)
-            divisor = tl.where(radius > 0.0, radius, 1.0)
-            w11 = tl.sqrt(xx + isotropic + 0.5 * minor * (1.0 - half / divisor))
-            is_thin = short < least
-            _store(cholesky, 3 * row, tl.where(is_thin, w11, l11), mask)
-            _store(cholesky, 3 * row + 1, tl.where(is_thin, (xy - 0.5 * minor * (xy / divisor)) / w11, l21), mask)
-            _store(cholesky, 3 * row + 2, tl.where(is_thin, tl.sqrt(new_long * new_short) / w11, l22), mask)
+            l11, l21, l22 = _widen(l11, l21, l22, min_sigma)
+            _store(cholesky, 3 * row, l11, mask)
+            _store(cholesky, 3 * row + 1, l21, mask)
+            _store(cholesky, 3 * row + 2, l22, mask)

@@ -15,7 +15,7 @@ from kcgs._check import check_number
 from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.nn import GaussianField
 
-from .adam import COLOR_RANGE, FROZEN, bounds_of, check_gradients, init_state, step_groups, within_bounds
+from .adam import COLOR_RANGE, FROZEN, bounds_of, check_gradients, init_state, state_shapes, step_groups, within_bounds
 from .run import cosine_decay
 
 # step of centres, in standard deviations, and of log scales; step of colours: tuned on photos, good on all images
@@ -37,7 +37,7 @@ class GaussianAdam(Optimizer):
             each replay of a CUDA graph.
         color_lr: step of colours and opacities.
         betas: decay of the averages of gradients and of squared gradients.
-        eps: added to the root of the average of squared gradients.
+        eps: added to the root of the average of squared gradients, above 0.
         min_sigma: least standard deviation, in pixels. Thinner Gaussians fit the pixels' centres better, but become
             dots and needles when a scene is enlarged.
         max_step: largest step of centres in standard deviations, and of log scales.
@@ -81,11 +81,12 @@ class GaussianAdam(Optimizer):
         max_step: float = 0.5,
         bounded: bool = False,
     ) -> None:
-        for name, value in {"lr": lr, "color_lr": color_lr, "eps": eps, "min_sigma": min_sigma}.items():
+        for name, value in {"lr": lr, "color_lr": color_lr, "min_sigma": min_sigma}.items():
             check_number(name, float(value) if isinstance(value, Tensor) else value, 0.0)
+        check_number("eps", eps, 0.0, above=True)
         check_number("max_step", max_step, 0.0, above=True)
-        if not all(0 <= beta < 1 for beta in betas):
-            raise InvalidArgument("betas", "in [0, 1)", betas)
+        if len(betas) != 2 or not all(0 <= beta < 1 for beta in betas):
+            raise InvalidArgument("betas", "two numbers in [0, 1)", betas)
         groups: list[dict[str, Any]] = []
         for field in [fields] if isinstance(fields, nn.Module) and not isinstance(fields, nn.ModuleList) else fields:
             if not isinstance(field, GaussianField):
@@ -138,6 +139,22 @@ class GaussianAdam(Optimizer):
         for group in self.param_groups:
             group.setdefault("bounded", False)  # a setting that version 0.3 did not have
 
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take settings and averages.
+
+        Args:
+            state_dict: of an optimizer whose fields have as many Gaussians and channels.
+
+        Raises:
+            ValueError: averages of another shape.
+        """
+        for group, saved in zip(self.param_groups, state_dict["param_groups"], strict=False):  # torch compares lengths
+            averages, expected = state_dict["state"].get(saved["params"][0], {}), state_shapes(group)
+            received = {name: tuple(table.shape) for name, table in averages.items()}
+            if received and received != expected:
+                raise InvalidArgument("state_dict", f"of {expected}", received)
+        super().load_state_dict(state_dict)
+
     @torch.no_grad()
     def append(self, field: GaussianField, added: GaussianField) -> None:
         """Add Gaussians to one of the optimizer's fields; the averages of the field's present Gaussians stay.
@@ -177,10 +194,7 @@ class GaussianAdam(Optimizer):
                 Gaussians in one image than in another.
         """
         self._group(field)
-        shapes = (field.means.shape[-2:-1], field.means.shape[:-1])
-        if mask.dtype != torch.bool or mask.shape not in shapes:
-            expected = " or ".join(f"({', '.join(map(str, shape))})" for shape in dict.fromkeys(shapes))
-            raise InvalidArgument("mask", f"boolean, {expected}", f"{mask.dtype}, {tuple(mask.shape)}")
+        _check_mask(mask, field.means.shape[-2:-1], field.means.shape[:-1])
         index = mask.nonzero()[:, -1]
         if mask.ndim == 2:
             counts = mask.sum(1)
@@ -217,9 +231,7 @@ class GaussianAdam(Optimizer):
             tensor([False,  True,  True,  True])
         """
         geometry = self._group(field)
-        expected = field.means.shape[:-1]
-        if mask.dtype != torch.bool or mask.shape != expected:
-            raise InvalidArgument("mask", f"boolean, {tuple(expected)}", f"{mask.dtype}, {tuple(mask.shape)}")
+        _check_mask(mask, field.means.shape[:-1])
         colors = next(group for group in self.param_groups if group["params"][0] is field.colors)
         for group in (geometry, colors):
             state = self.state[group["params"][0]]
@@ -257,6 +269,12 @@ def _layout(field: GaussianField) -> str:
     *batch, _, channels = field.colors.shape
     optional = [name for name in ("region_ids", "opacities") if getattr(field, name) is not None]
     return " and ".join([f"colors ({', '.join(map(str, [*batch, 'N', channels]))})", *optional])
+
+
+def _check_mask(mask: Tensor, *shapes: torch.Size) -> None:
+    if mask.dtype != torch.bool or mask.shape not in shapes:
+        expected = " or ".join(str(tuple(shape)) for shape in dict.fromkeys(shapes))
+        raise InvalidArgument("mask", f"boolean, {expected}", f"{mask.dtype}, {tuple(mask.shape)}")
 
 
 def _select_rows(table: Tensor, index: Tensor, rows: int) -> Tensor:

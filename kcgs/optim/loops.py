@@ -1,4 +1,4 @@
-"""The steps of `adam.py` in compiled loops: tables of float32 on the CPU, intermediate numbers in float64.
+"""The step of `adam.py` in compiled loops: tables of float32 on the CPU, intermediate numbers in float64.
 
 With torch operations a fit takes 16 to 20 % longer.
 """
@@ -21,8 +21,8 @@ def _clamp(value, low, high):
 
 
 @inner
-def _move(numbers, average, square, adam, age):
-    """Replace gradients by Adam's steps, and update their averages, which all have one age."""
+def _adam(numbers, average, square, adam, age):
+    """Replace gradients of one age by Adam's steps, and update their averages."""
     rate, root = adam.lr / (1.0 - adam.beta1**age), 1.0 / math.sqrt(1.0 - adam.beta2**age)
     for i in range(len(numbers)):
         gradient = np.float64(numbers[i])
@@ -33,7 +33,7 @@ def _move(numbers, average, square, adam, age):
 
 
 @inner
-def _step(numbers, adam, begin):
+def _adam_rows(numbers, adam, begin):
     """Replace gradients [N, K], of rows from `begin` on, by Adam's steps; adjacent rows of one age go together.
 
     Rows of a negative age are frozen: their step is 0.
@@ -49,13 +49,13 @@ def _step(numbers, adam, begin):
         if age < 0:
             flat[first * columns : last * columns] = 0.0
         else:
-            _move(flat[first * columns : last * columns], average[part], square[part], adam, np.float64(age + 1))
+            _adam(flat[first * columns : last * columns], average[part], square[part], adam, np.float64(age + 1))
         first = last
 
 
 @inner
 def _widen(l11, l21, l22, min_sigma):
-    """Return a factor whose standard deviations are at least `min_sigma`, as `frame.widen` does."""
+    """Return the factor of `frame.widen`."""
     xx, xy, yy, least = l11 * l11, l11 * l21, l21 * l21 + l22 * l22, min_sigma * min_sigma
     if xx >= least and (xx - least) * (yy - least) >= xy * xy:
         return l11, l21, l22
@@ -93,6 +93,7 @@ def step_geometry(means, cholesky, means_gradient, cholesky_gradient, moves, ada
 def _step_geometry(means, cholesky, means_gradient, cholesky_gradient, moves, adam, bounds, rows):
     begin, end = rows
     steps = np.empty((end - begin, 5), np.float32)
+    # frame.local_gradient
     for i in range(begin, end):
         l11, l21, l22 = cholesky[i, 0], cholesky[i, 1], cholesky[i, 2]
         gx, gy = means_gradient[i, 0], means_gradient[i, 1]
@@ -100,7 +101,8 @@ def _step_geometry(means, cholesky, means_gradient, cholesky_gradient, moves, ad
         step = steps[i - begin]
         step[0], step[1] = l11 * gx + l21 * gy, l22 * gy
         step[2], step[3], step[4] = l11 * g11 + l21 * g21, l22 * g21, l22 * g22
-    _step(steps, adam, begin)
+    _adam_rows(steps, adam, begin)
+    # frame.move, then adam.within_bounds
     most, max_factor = bounds.max_step, bounds.max_factor
     for i in range(begin, end):
         step = steps[i - begin]
@@ -124,7 +126,7 @@ def _step_geometry(means, cholesky, means_gradient, cholesky_gradient, moves, ad
 def step_tables(tables, gradient, adam):
     """Move tables by their gradients, which are side by side in one array [N, K]."""
     steps, column = gradient.copy(), 0
-    _step(steps, adam, 0)
+    _adam_rows(steps, adam, 0)
     for table in tables:
         for i in range(len(table)):
             for k in range(table.shape[1]):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,11 +17,31 @@ from .objectives import ImageObjective, Residual
 if TYPE_CHECKING:
     from .similarity import CompiledMsSsim
 
-# weight of the squared error, and its weight on a reduced photo: it has few Gaussians, and MS-SSIM likes stray strokes
+# weight of the squared error
 _SQUARED = 0.003
+# the same on a reduced photo, which has few Gaussians: with less weight, MS-SSIM adds stray strokes
 _SQUARED_REDUCED = 0.03
-# least mean of a scale, since the logarithm has no bound at 0
+# least mean score of a scale, since the logarithm has no bound at 0
 _MIN_SCORE = 0.2
+
+
+class _Scale(NamedTuple):
+    """An image whose sides were halved k times, and what windows centred on its pixels see of it."""
+
+    image: Tensor  # [..., C, h, w]
+    inside: Tensor  # [1, h, w], inverse of the sum of a window's taps inside the image
+    mean: Tensor  # [..., C, h, w]
+    variance: Tensor  # [..., C, h, w]
+    weight: float  # of a window
+
+
+class _Band(NamedTuple):
+    """A part of the quadratic form near the image: the energy that a first blur leaves and a second one removes."""
+
+    octave: int  # the sides of `importance` were halved so often
+    first: float  # variance of the first blur, in pixels of the image
+    second: float
+    importance: Tensor  # [..., h, w]
 
 
 class MsSsim(ImageObjective):
@@ -56,7 +76,7 @@ class MsSsim(ImageObjective):
     def __init__(self, image: Tensor, reduction: int = 1) -> None:
         super().__init__(image)
         self._squared = _SQUARED if reduction == 1 else _SQUARED_REDUCED
-        self._scales: list[tuple[Tensor, Tensor, Tensor, Tensor, float]] = []
+        self._scales: list[_Scale] = []
         masks, plane = [], image
         for weight in SCALE_WEIGHTS[reduction.bit_length() :]:
             plane = halve(plane)
@@ -65,30 +85,30 @@ class MsSsim(ImageObjective):
             inside = 1.0 / _blur(image.new_ones(1, *plane.shape[-2:]))
             mean, square = (inside * _blur(t) for t in (plane, plane * plane))
             variance, weight = (square - mean * mean).clamp_min(0.0), weight / plane.shape[-2:].numel()
-            self._scales.append((plane, inside, mean, variance, weight))
+            self._scales.append(_Scale(plane, inside, mean, variance, weight))
             masks.append(_blur(inside * weight / (2.0 * variance + K2**2)).mean(-3))
         # Z of each image, in float64
         self._norm = image.new_zeros(image.shape[:-3], dtype=torch.float64)
         for mask in masks:
             self._norm += mask.mean((-2, -1))
-        black = torch.full_like(image[..., 0, :, :], self._squared)
-        masks = [black, *(mask / self._norm_of(mask) for mask in masks)]
-        parts = [mask.unsqueeze(-3) * 0.25**level for level, mask in enumerate(masks)]
+        of_squared_error = torch.full_like(image[..., 0, :, :], self._squared)
+        masks = [of_squared_error, *(mask / self._norm_of(mask) for mask in masks)]
+        parts = [mask.unsqueeze(-3) * 0.25**octave for octave, mask in enumerate(masks)]
         self.importance = self._sum_up(parts).squeeze(-3)
-        self._bands = [(0, 0.0, math.inf, masks[0])]
-        for level, mask in enumerate(masks[1:], 1):
+        self._bands = [_Band(0, 0.0, math.inf, masks[0])]
+        for octave, mask in enumerate(masks[1:], 1):
             # the mean under the window is no part of contrast and structure
-            blocks, window = (4**level - 1) / 12, SSIM_SIGMA**2 * 4**level
-            self._bands.append((level, blocks, blocks + window, mask))
+            blocks, window = (4**octave - 1) / 12, SSIM_SIGMA**2 * 4**octave
+            self._bands.append(_Band(octave, blocks, blocks + window, mask))
         if self._scales:
             _, inside, mean, _, weight = self._scales[-1]
-            bright = _blur(inside * weight / self._norm_of(mean) / (2.0 * mean * mean + K1**2)).mean(-3)
-            self._bands.append((level, blocks + window, math.inf, bright))
+            of_luminance = _blur(inside * weight / self._norm_of(mean) / (2.0 * mean * mean + K1**2)).mean(-3)
+            self._bands.append(_Band(octave, blocks + window, math.inf, of_luminance))
         self._compiled: CompiledMsSsim | None = None
         if self._scales and image.device.type == "cpu" and image.dtype == torch.float32:
             from .similarity import CompiledMsSsim  # loads numba
 
-            factors = [weight / self._norm * 0.25**level for level, (*_, weight) in enumerate(self._scales, 1)]
+            factors = [scale.weight / self._norm * 0.25**octave for octave, scale in enumerate(self._scales, 1)]
             scales = [[plane.reshape(-1, *plane.shape[-2:]).numpy() for plane in planes] for *planes, _ in self._scales]
             table = torch.stack(factors).reshape(len(factors), -1).numpy()
             self._compiled = CompiledMsSsim(scales, table, _MIN_SCORE)  # the compiled form of `_measure`
@@ -139,17 +159,17 @@ class MsSsim(ImageObjective):
             """Return the share of a Gaussian's energy that is left after a blur of this variance."""
             return l11 * l22 / ((xx + variance) * (yy + variance) - xy**2).sqrt()
 
-        for level, fine, coarse, mask in self._bands:
-            height, width = mask.shape[-2:]
-            pixels = (y >> level).clamp(0, height - 1) * width + (x >> level).clamp(0, width - 1)
-            at_centres = mask.flatten(-2).gather(-1, pixels)
-            total += 0.25**level * at_centres * (energy_after(fine) - energy_after(coarse))
+        for octave, first, second, importance in self._bands:
+            height, width = importance.shape[-2:]
+            pixels = (y >> octave).clamp(0, height - 1) * width + (x >> octave).clamp(0, width - 1)
+            weight = importance.flatten(-2).gather(-1, pixels)
+            total += 0.25**octave * weight * (energy_after(first) - energy_after(second))
         return total
 
     def _measure(self, difference: Tensor) -> tuple[Tensor, Tensor]:
         """Return E without the squared error, as a sum over pixels, and half the gradient of all of E."""
         total, gradients, plane = difference.new_zeros(difference.shape[:-3]), [self._squared * difference], difference
-        for level, (image, inside, mean, variance, weight) in enumerate(self._scales, 1):
+        for octave, (image, inside, mean, variance, weight) in enumerate(self._scales, 1):
             plane = halve(plane)
             render = image + plane
             # one blur after the other, so that each stays in a processor's cache
@@ -157,7 +177,7 @@ class MsSsim(ImageObjective):
             variances = (square - render_mean * render_mean).clamp_min_(0.0).add_(variance).add_(K2**2)
             structure = (product - mean * render_mean).mul_(2.0).add_(K2**2).div_(variances)
             luminance, luminance_slope = structure.new_ones(()), structure.new_zeros(())
-            if level == len(self._scales):
+            if octave == len(self._scales):
                 means = mean * mean + render_mean * render_mean + K1**2
                 luminance = (2.0 * mean * render_mean + K1**2) / means
                 luminance_slope = structure * (luminance * render_mean - mean) / means
@@ -166,7 +186,7 @@ class MsSsim(ImageObjective):
             total -= (weight / self._norm * area).to(total) * score.log().mean(-1)
             # windows at even rows and columns stand for all windows
             share = torch.zeros_like(plane)
-            factor = (weight / self._norm * 0.25**level * area / windows.shape[-2:].numel()).to(share)
+            factor = (weight / self._norm * 0.25**octave * area / windows.shape[-2:].numel()).to(share)
             share[..., ::2, ::2] = inside[:, ::2, ::2] * factor.view(*factor.shape, 1, 1, 1) / score[..., None, None]
             by_product = share * luminance / variances
             by_square = by_product * structure

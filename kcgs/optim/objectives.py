@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kcgs._torch_internals import differentiate
 from kcgs.errors import InvalidArgument
 
 from .gaussians import Gaussians, Renderer
@@ -69,7 +70,7 @@ class Objective(ABC):
             with torch.enable_grad():
                 render = renderer.render(leaves)
         # `data`, since the slope may overwrite it, which the graph does not notice
-        return Gaussians(*torch.autograd.grad(render, leaves[:3], self.slope(render.data)))
+        return Gaussians(*differentiate(render, leaves[:3], self.slope(render.data)))
 
 
 class ImageObjective(Objective):
@@ -161,7 +162,8 @@ class LossObjective(Objective):
         if self.image is not None:
             return Residual(self.image - render)
         slope = self.slope(render)
-        steps = [slope * (-(0.5**k) / slope.abs().max()) for k in range(_NUM_STEPS)]
+        largest = slope.abs().max().clamp_min(torch.finfo(slope.dtype).tiny)  # a slope of 0 gives steps of 0
+        steps = [slope * (-(0.5**k) / largest) for k in range(_NUM_STEPS)]
         return Residual(min(steps, key=lambda step: float(self.value(render + step))))
 
     @staticmethod

@@ -127,11 +127,13 @@ class ReparametrizedOptimizer(ABC):
         return none if self.frozen is None else self.frozen[..., 0]
 
     def state_dict(self) -> dict[str, Any]:
-        """Return parameters and averages."""
-        return {"parameters": [p.detach() for p in self.parameters], "optimizer": self.optimizer.state_dict()}
+        """Return parameters, averages and the mask of the frozen Gaussians."""
+        parameters = [p.detach() for p in self.parameters]
+        return {"parameters": parameters, "optimizer": self.optimizer.state_dict(), "frozen": self.frozen}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up parameters and averages."""
+        """Take what `state_dict` returned."""
+        self.frozen = state["frozen"]
         self._set(state["parameters"])
         self.optimizer.load_state_dict(state["optimizer"])
 

@@ -61,25 +61,25 @@ def _taps(scales):
 
 
 @inner
-def _at(plane, other, y, x):
+def _pixel(plane, other, y, x):
     """Return a value of a plane, or of its product with another."""
     return plane[y, x] if other is None else plane[y, x] * other[y, x]
 
 
 @inner
-def _down(plane, other, y, taps, upper, lower):
+def _blur_columns(plane, other, y, taps, upper, lower):
     """Blur a padded plane, or the product of two, along columns, at rows y and y + 2."""
     for x in range(plane.shape[1]):
-        first, second = taps[0] * _at(plane, other, y + MARGIN, x), taps[0] * _at(plane, other, y + MARGIN + 2, x)
+        first, second = taps[0] * _pixel(plane, other, y + MARGIN, x), taps[0] * _pixel(plane, other, y + MARGIN + 2, x)
         for k in range(1, MARGIN + 1):
             above, below = y + MARGIN - k, y + MARGIN + k
-            first += taps[k] * (_at(plane, other, above, x) + _at(plane, other, below, x))
-            second += taps[k] * (_at(plane, other, above + 2, x) + _at(plane, other, below + 2, x))
+            first += taps[k] * (_pixel(plane, other, above, x) + _pixel(plane, other, below, x))
+            second += taps[k] * (_pixel(plane, other, above + 2, x) + _pixel(plane, other, below + 2, x))
         upper[x], lower[x] = first, second
 
 
 @inner
-def _across(row, taps, target):
+def _blur_row(row, taps, target):
     """Blur a row of a padded plane, for the windows of a row."""
     for x in range(len(target)):
         k = 2 * x
@@ -89,7 +89,7 @@ def _across(row, taps, target):
 
 
 @inner
-def _up(slopes, k, taps, upper, lower):
+def _spread_columns(slopes, k, taps, upper, lower):
     """Spread windows along columns to two rows of pixels: the row of window row k + 2, and the next row."""
     for x in range(slopes.shape[1]):
         a, b, c = slopes[k, x], slopes[k + 1, x], slopes[k + 2, x]
@@ -99,7 +99,7 @@ def _up(slopes, k, taps, upper, lower):
 
 
 @inner
-def _along(row, taps, target):
+def _spread_row(row, taps, target):
     """Spread windows along a row to its columns; three zeros lie on either side."""
     for x in range(len(target) // 2):
         a, b, c, d, e, f = row[x + 1], row[x + 2], row[x + 3], row[x + 4], row[x + 5], row[x + 6]
@@ -153,8 +153,8 @@ def _halve(scales, difference, channel, first, last):
 
 
 @inner
-def _differentiate(rows, inside, mean, variance, scores, slopes):
-    """Fill a row of scores, and of their slopes by mean square, mean product and mean of the render."""
+def _score_row(rows, inside, mean, variance, scores, slopes):
+    """Fill a row of scores, and their slopes by mean square, mean product and mean of the render."""
     means, squares, products = rows[0], rows[1], rows[2]
     by_square, by_product, by_mean = slopes
     zero, two, c2 = np.float32(0.0), np.float32(2.0), np.float32(K2**2)
@@ -171,7 +171,7 @@ def _differentiate(rows, inside, mean, variance, scores, slopes):
 
 
 @inner
-def _brighten(means, inside, mean, scores, slopes):
+def _multiply_by_luminance(means, inside, mean, scores, slopes):
     """Multiply a row of scores by the luminance."""
     by_square, by_product, by_mean = slopes
     two, c1 = np.float32(2.0), np.float32(K1**2)
@@ -205,17 +205,17 @@ def _score(scales, scale, channel, first, last, has_gradient):
     slopes = np.zeros((3, last_window - first_window + 6, width + 6), np.float32)
     end = min(last_window + below, height)
     for top in range(max(first_window - above, 0), end, 2):
-        _down(render, None, 2 * top, taps, columns[0, 0], columns[0, 1])
-        _down(render, render, 2 * top, taps, columns[1, 0], columns[1, 1])
-        _down(render, image, 2 * top, taps, columns[2, 0], columns[2, 1])
+        _blur_columns(render, None, 2 * top, taps, columns[0, 0], columns[0, 1])
+        _blur_columns(render, render, 2 * top, taps, columns[1, 0], columns[1, 1])
+        _blur_columns(render, image, 2 * top, taps, columns[2, 0], columns[2, 1])
         for y in range(top, min(top + 2, end)):
             for k in range(3):
-                _across(columns[k, y - top], taps, rows[k])
+                _blur_row(columns[k, y - top], taps, rows[k])
             k = y - first_window + 2
             by = slopes[0, k, 3:-3], slopes[1, k, 3:-3], slopes[2, k, 3:-3]
-            _differentiate(rows, inside[y], mean[y], variance[y], scores, by)
+            _score_row(rows, inside[y], mean[y], variance[y], scores, by)
             if scale == len(scales.table) - 1:
-                _brighten(rows[0], inside[y], mean[y], scores, by)
+                _multiply_by_luminance(rows[0], inside[y], mean[y], scores, by)
             if first_window <= y < last_window:
                 for x in range(width):
                     totals[x] += scores[x]
@@ -238,15 +238,15 @@ def _spread(scales, scale, channel, first, last, slopes):
     columns, rows = np.empty((3, 2, width + 6), np.float32), np.empty((3, 2 * width), np.float32)
     for top in range(first, last, 2):
         for k in range(3):
-            _up(slopes[k], (top - first) // 2, taps, columns[k, 0], columns[k, 1])
+            _spread_columns(slopes[k], (top - first) // 2, taps, columns[k, 0], columns[k, 1])
         for y in range(top, min(top + 2, last)):
             for k in range(3):
-                _along(columns[k, y - top], taps, rows[k])
-            _combine(rows, render[y + MARGIN, MARGIN:], image[y + MARGIN, MARGIN:], target[y])
+                _spread_row(columns[k, y - top], taps, rows[k])
+            _sum_slopes(rows, render[y + MARGIN, MARGIN:], image[y + MARGIN, MARGIN:], target[y])
 
 
 @inner
-def _combine(rows, render, image, target):
+def _sum_slopes(rows, render, image, target):
     """Turn three rows of slopes, by mean square, mean product and mean, into the gradient."""
     by_square, by_product, by_mean = rows[0], rows[1], rows[2]
     for x in range(len(target)):
@@ -255,6 +255,7 @@ def _combine(rows, render, image, target):
 
 @inner
 def _mean_score(scales, sums, tasks, scale, channel):
+    """Return the mean score of a channel's windows, at least `least`, from the sums of the tasks."""
     total = 0.0
     for k in range(len(tasks)):
         if tasks[k, PHASE] == SCORE and tasks[k, SCALE] == scale and tasks[k, CHANNEL] == channel:
@@ -264,7 +265,7 @@ def _mean_score(scales, sums, tasks, scale, channel):
 
 
 @inner
-def _add(row, factor, coarse):
+def _add_coarser(row, factor, coarse):
     """Multiply a row by a factor, and add to each pixel the value of its block in a coarser row."""
     for x in range(len(coarse)):
         row[2 * x] = row[2 * x] * factor + coarse[x]
@@ -274,7 +275,7 @@ def _add(row, factor, coarse):
 
 
 @inner
-def _sum(scales, difference, squared, sums, tasks, k):
+def _sum_scales(scales, difference, squared, sums, tasks, k):
     """Fill rows of the gradient by the image's pixels: gradients of coarser scales are added to finer scales."""
     table, channel = scales.table, tasks[k, CHANNEL]
     first, last = tasks[k, FIRST], tasks[k, LAST]
@@ -286,11 +287,11 @@ def _sum(scales, difference, squared, sums, tasks, k):
         coarse = _plane(scales, scale + has_coarse, channel)
         rows = table[scale + 1, HEIGHT] if has_coarse else 0
         for y in range(first >> scale, last >> scale):
-            _add(plane[y], factor, coarse[y // 2] if y // 2 < rows else nothing)
+            _add_coarser(plane[y], factor, coarse[y // 2] if y // 2 < rows else nothing)
     plane = _plane(scales, 0, channel)
     end = difference.shape[1] if last == len(plane) else 2 * last
     for y in range(2 * first, end):
-        _add(difference[channel, y], np.float32(squared), plane[y // 2] if y // 2 < len(plane) else nothing)
+        _add_coarser(difference[channel, y], np.float32(squared), plane[y // 2] if y // 2 < len(plane) else nothing)
 
 
 @program.entry
@@ -304,5 +305,5 @@ def run_phases(scales, difference, squared, sums, has_gradient, tasks, counters)
         elif phase == SCORE:
             sums[k] = _score(scales, scale, channel, first, last, has_gradient)
         else:
-            _sum(scales, difference, squared, sums, tasks, k)
+            _sum_scales(scales, difference, squared, sums, tasks, k)
         k = next_task(tasks, counters, k)

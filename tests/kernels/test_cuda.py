@@ -106,7 +106,7 @@ def test_auto_says_why_it_takes_tiled(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise RuntimeError("no C compiler")
 
-    monkeypatch.setattr(registry, "_try", fail)
+    monkeypatch.setattr(registry, "_splat_once", fail)
     registry._compiles.cache_clear()
     with pytest.warns(UserWarning, match="'auto' takes 'tiled' on cuda, which is slower: RuntimeError: no C compiler"):
         assert registry._choose("auto", torch.device("cuda"), torch.float32) == "tiled"

@@ -48,6 +48,12 @@ def test_nothing_to_render(count: int, regions: int) -> None:
     assert all(torch.equal(gradient, torch.zeros_like(t)) for gradient, t in zip(grads, scene[:3], strict=True))
 
 
+def test_keys_beyond_32_bits() -> None:
+    """A large map has many tiles and many regions, and its arrays are int32."""
+    starts, regions = torch.arange(70_001, dtype=torch.int32), torch.full((70_000,), 69_999, dtype=torch.int32)
+    assert int(tiled.keys_of(starts, regions, 70_000)[-1]) == 70_000**2 - 1
+
+
 def test_same_bits_on_several_threads() -> None:
     scene = random_scene(5000, (16, 20), 2)  # many pieces of one tile
     region_map = RegionMap.from_labels(scene.labels, 0.7)

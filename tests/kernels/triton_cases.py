@@ -201,8 +201,8 @@ def test_same_bits_every_time() -> None:
 
 def test_without_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
     """A plan that does not wait has room for 1.5 times the most; beyond that all is NaN until there is more room."""
-    monkeypatch.setattr(capacity, "_LEAST_ROOM", 1)
-    capacity._most.clear()
+    monkeypatch.setattr(capacity, "_SPARE_SLOTS", 1)
+    capacity._max_slots.clear()
     inputs = make_inputs(8, size=(9, 48))
     inputs = inputs._replace(
         cholesky=torch.full_like(inputs.cholesky, 0.4).mul_(torch.tensor([1, 0, 1], device=DEVICE))
@@ -354,8 +354,8 @@ def test_graph_of_a_step() -> None:
 
 @needs_gpu
 def test_graph_is_nan_where_lists_do_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(capacity, "_LEAST_ROOM", 1)
-    capacity._most.clear()
+    monkeypatch.setattr(capacity, "_SPARE_SLOTS", 1)
+    capacity._max_slots.clear()
     inputs = make_inputs(50, size=(64, 64))._replace(
         cholesky=torch.tensor([0.5, 0.0, 0.5], device=DEVICE).expand(1, 50, 3)
     )

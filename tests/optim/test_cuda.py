@@ -34,7 +34,6 @@ def test_compiles_without_a_gpu(
     monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
     constants = {"CHANNELS": 3, "COLUMNS": 3 + opacities, "MEANS": True, "CHOLESKY": True, "COLORS": True}
     constants |= {"OPACITIES": opacities, "LR_LOADED": rate == "*fp32", "COLOR_LR_LOADED": rate == "*fp32"}
-    constants["ROWS"] = cuda._ROWS
     types = {**dict.fromkeys(NUMBERS, "fp32"), **dict.fromkeys(("lr", "color_lr"), rate), "count": "i32"}
     types |= dict.fromkeys(constants, "constexpr")
     signature = {name: types.get(name, "*fp32") for name in cuda._step.jit.arg_names}

@@ -211,13 +211,23 @@ class TestProtocol:
             ([], {}, ValueError, "empty parameter list"),
             (field_of(), {"lr": -1.0}, ValueError, "^lr must be finite and at least 0; got -1.0"),
             (field_of(), {"color_lr": torch.tensor(math.nan)}, ValueError, "color_lr must be .*; got nan"),
-            (field_of(), {"betas": (0.9, 1.0)}, ValueError, r"betas must be in \[0, 1\); got \(0.9, 1.0\)"),
+            (field_of(), {"betas": (0.9, 1.0)}, ValueError, r"betas must be two numbers in \[0, 1\); got \(0.9, 1.0\)"),
+            (field_of(), {"betas": (0.9,)}, ValueError, r"betas must be two numbers in \[0, 1\); got \(0.9,\)"),
+            (field_of(), {"eps": 0.0}, ValueError, "eps must be finite and above 0; got 0.0"),
             (field_of(), {"max_step": 0}, ValueError, "max_step must be finite and above 0; got 0"),
         ],
     )
     def test_bad_input(self, fields: Any, settings: dict[str, Any], error: type[Exception], words: str) -> None:
         with pytest.raises(error, match=words):
             GaussianAdam(fields, **settings)
+
+    @pytest.mark.parametrize(("count", "channels"), [(7, 3), (20, 1)])
+    def test_a_state_of_other_fields(self, count: int, channels: int) -> None:
+        other = GaussianField.random(count, SIZE, channels=channels)
+        optimizer = GaussianAdam(other)
+        optimizer.freeze(other, torch.ones(count, dtype=torch.bool))
+        with pytest.raises(ValueError, match=r"state_dict must be of {'age': \(20, 1\), 'average': .*; got {'age': "):
+            GaussianAdam(field_of()).load_state_dict(optimizer.state_dict())
 
     def test_other_parameters(self) -> None:
         with pytest.raises(ValueError, match="param_group must be a GaussianField's: train other parameters with"):
@@ -270,7 +280,7 @@ class TestProtocol:
     @pytest.mark.parametrize("mask", [torch.ones(3) > 0, torch.ones(20), torch.arange(20)])
     def test_no_mask(self, mask: Tensor) -> None:
         field = field_of()
-        with pytest.raises(ValueError, match=r"mask must be boolean, \(20\); got torch\."):
+        with pytest.raises(ValueError, match=r"mask must be boolean, \(20,\); got torch\."):
             GaussianAdam(field).keep(field, mask)
 
     def test_new_rows_are_as_wide_as_a_loaded_state_asks(self) -> None:
@@ -301,7 +311,7 @@ def test_keep_takes_a_mask_for_each_image() -> None:
         assert all(torch.equal(a[name][k], b[name]) for a, b in pairs for name in a)
     with pytest.raises(ValueError, match=r"mask must be of as many Gaussians in each image; got \[13, 12, 13\]"):
         optimizer.keep(batch, torch.arange(13) < torch.tensor([[13], [12], [13]]))
-    with pytest.raises(ValueError, match=r"mask must be boolean, \(13\) or \(3, 13\); got"):
+    with pytest.raises(ValueError, match=r"mask must be boolean, \(13,\) or \(3, 13\); got"):
         optimizer.keep(batch, torch.ones(2, 13) > 0)
 
 

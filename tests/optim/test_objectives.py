@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -69,6 +71,9 @@ class TestLoss:
         assert float(error.abs().max()) == pytest.approx(2.0 ** round(math.log2(float(error.abs().max()))))
         assert objective.value(RENDER + error) < objective.value(RENDER)
 
+    def test_a_slope_of_zero_leaves_no_residual(self) -> None:
+        assert torch.equal(LossObjective(lambda render: 0.0 * render.sum()).residual(RENDER).error, 0.0 * RENDER)
+
     def test_what_is_no_loss_is_refused(self) -> None:
         for loss, words in (
             (lambda render: render, r"a function that returns a scalar tensor; got shape \(3, 24, 40\)"),
@@ -77,3 +82,17 @@ class TestLoss:
         ):
             with pytest.raises(ValueError, match=f"objective must be {words}"):
                 LossObjective(loss).slope(RENDER)
+
+
+def test_gradients_load_no_sympy() -> None:
+    """It would take 0.4 s of each process."""
+    code = """
+import sys, torch
+from kcgs import GaussianField
+from kcgs.optim import Gaussians, Renderer
+from kcgs.optim.objectives import AbsoluteError
+gaussians = Gaussians.of(GaussianField.random(3, (16, 24), seed=0))
+AbsoluteError(torch.zeros(3, 16, 24)).gradients(Renderer((16, 24)), gaussians)
+assert "sympy" not in sys.modules
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)

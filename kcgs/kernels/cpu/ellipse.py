@@ -31,7 +31,7 @@ _MARGIN = 1e-3
 
 
 @inline
-def bounded(value):
+def clamp_coefficient(value):
     """Clamp a coefficient of z."""
     return min(max(value, -Z_LIMIT), Z_LIMIT)
 
@@ -89,15 +89,15 @@ def block_rows(g, row, col, height, width, radius):
 
 
 @inline
-def enter(g, row, col, first, shape):
+def set_shape(g, row, col, first, shape):
     """Set `shape`, float32, to k of z1 = k0 + k1 x and z2 = k2 + k3 x + k4 y, to CHANGE, and to y of the first row.
 
     z is multiplied by SCALE; x and y are nodes from the block's middle.
     """
     x, y = col * SIDE + SIDE / 2 - g[MEAN_X], row * SIDE + SIDE / 2 - g[MEAN_Y]
-    shape[0] = bounded(g[SLOPE1_X] * x)
+    shape[0] = clamp_coefficient(g[SLOPE1_X] * x)
     shape[1] = g[SLOPE1_X]
-    shape[2] = bounded(g[SLOPE2_Y] * y + g[SLOPE2_X] * x)
+    shape[2] = clamp_coefficient(g[SLOPE2_Y] * y + g[SLOPE2_X] * x)
     shape[3] = g[SLOPE2_X]
     shape[4] = g[SLOPE2_Y]
     shape[5] = g[CHANGE]

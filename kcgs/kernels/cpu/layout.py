@@ -73,7 +73,7 @@ class Lists(NamedTuple):
     colors: Any  # [N * C] float32, times COLOR_FACTOR
     start: Any  # [copies * K + 1] int64 into pairs; images that share a map have a copy of its blocks each
     pairs: Any  # [P, 7] int32, by block, then by Gaussian
-    shapes: Any  # [P, 7] float32, the Gaussian in the block, see ellipse.enter; in the order of sums
+    shapes: Any  # [P, 7] float32, the Gaussian in the block, see ellipse.set_shape; in the order of sums
     first_terms: Any  # [N + 1] int64, place of each Gaussian's first sums
     num_terms: Any  # [N] int32, blocks that each Gaussian touches
     table: TileTable

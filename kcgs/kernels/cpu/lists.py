@@ -11,7 +11,7 @@ from kcgs.compiled.tasks import first_task, next_task
 
 from ..grid_columns import FIRST_TILE, NODE_COLS, NODE_ROWS, TILE_COLS, TILE_ROWS
 from ..whitened import LEAST_SCALE, MEAN_LIMIT, SCALE, SCALE_LIMITS
-from .ellipse import block_rows, bounded, enter, row_halves, tile_rows
+from .ellipse import block_rows, clamp_coefficient, row_halves, set_shape, tile_rows
 from .layout import (
     CHANGE,
     COLOR_FACTOR,
@@ -169,7 +169,7 @@ def _find_blocks(batch, radius, spans, blocks, histogram, lists, begin, end):
                 if first < last:
                     blocks[place, 0], blocks[place, 1], blocks[place, 2] = head + block, first, last
                     blocks[place, 3], blocks[place, 4] = max(left - col * HALVES, 0), min(right - col * HALVES, HALVES)
-                    enter(g, row, col, first, lists.shapes[place])
+                    set_shape(g, row, col, first, lists.shapes[place])
                     histogram[head + block] += 1
                     place += 1
         lists.num_terms[i] = place - lists.first_terms[i]
@@ -225,10 +225,10 @@ def _fill(g, mean, cholesky, levels, spacing):
     g[SIGMA_Y] = math.sqrt(g[L21] * g[L21] + g[L22] * g[L22])
     g[INVERSE_L11] = 1.0 / g[L11]
     g[PEAK] = g[L21] / g[SIGMA_Y]
-    g[SLOPE1_X] = bounded(SCALE * g[INVERSE_L11])
+    g[SLOPE1_X] = clamp_coefficient(SCALE * g[INVERSE_L11])
     g[SLOPE2_Y] = SCALE / g[L22]
-    g[SLOPE2_X] = bounded(-g[SLOPE2_Y] * g[L21] * g[INVERSE_L11])
-    g[SLOPE2_Y] = bounded(g[SLOPE2_Y])
+    g[SLOPE2_X] = clamp_coefficient(-g[SLOPE2_Y] * g[L21] * g[INVERSE_L11])
+    g[SLOPE2_Y] = clamp_coefficient(g[SLOPE2_Y])
     g[CHANGE] = math.expm1(-g[SLOPE2_Y] * g[SLOPE2_Y] * _LOG_4)
 
 

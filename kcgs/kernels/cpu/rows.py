@@ -163,7 +163,7 @@ def add_rows(typing_context, pixels, origin, channels, pairs, number, shapes, co
         rows.specialize(emit)
         return context.get_dummy_value()
 
-    return types.void(*_types(pixels, pairs, shapes, colors, masks)), generate
+    return types.void(*_common_types(pixels, pairs, shapes, colors, masks)), generate
 
 
 @intrinsic
@@ -193,11 +193,11 @@ def gather_rows(
         rows.specialize(emit)
         return context.get_dummy_value()
 
-    kinds = _types(pixels, pairs, shapes, colors, masks)
+    kinds = _common_types(pixels, pairs, shapes, colors, masks)
     return types.void(*kinds, sums, terms, types.int64), generate
 
 
-def _types(pixels: Any, pairs: Any, shapes: Any, colors: Any, masks: Any) -> tuple[Any, ...]:
+def _common_types(pixels: Any, pairs: Any, shapes: Any, colors: Any, masks: Any) -> tuple[Any, ...]:
     """Return the types of the arguments in common."""
     number = types.int64
     return pixels, number, number, pairs, number, shapes, colors, types.float32, masks, number

@@ -19,12 +19,14 @@ from kcgs._warn import warn_user
 
 from ..interface import SplatInputs
 
-_ROOM, _LEAST_ROOM = 1.5, 1 << 16
+# room in units of the largest number of slots seen, and slots of room besides
+_ROOM_FACTOR = 1.5
+_SPARE_SLOTS = 1 << 16
 # the programs count slots in 32 bits
-_MOST_SLOTS = (1 << 31) - 1
+_SLOT_LIMIT = (1 << 31) - 1
 
 # slots of the largest plan of a device, a number of images and a size
-_most: dict[tuple[torch.device, int, tuple[int, int]], int] = {}
+_max_slots: dict[tuple[torch.device, int, tuple[int, int]], int] = {}
 # int64 counters, by device and whether plans wait (False: within `without_waiting`): plans whose lists did not fit,
 # plans whose values were not finite, and the most slots of a plan
 _notes: dict[tuple[torch.device, bool], Tensor] = {}
@@ -46,26 +48,26 @@ def reserve(inputs: SplatInputs) -> int | None:
     captured = inputs.means.is_cuda and torch.cuda.is_current_stream_capturing()
     if _waits.get() and not captured:
         return None
-    most = _most.get(_key(inputs))
+    most = _max_slots.get(_key(inputs))
     if captured and most is None:
         images, (height, width) = inputs.num_images, inputs.size
         raise RuntimeError(
             f"region_splat of {images} x {height} x {width} cannot be captured before it was rendered once: the room "
             "for its lists is not known; call it before the capture, with Gaussians as large as there will be"
         )
-    return None if most is None else min(int(_ROOM * most) + _LEAST_ROOM, _MOST_SLOTS)
+    return None if most is None else min(int(_ROOM_FACTOR * most) + _SPARE_SLOTS, _SLOT_LIMIT)
 
 
 def remember(inputs: SplatInputs, slots: int) -> None:
     """Make room, from now on, for plans of so many slots."""
     key = _key(inputs)
-    _most[key] = max(slots, _most.get(key, 0))
+    _max_slots[key] = max(slots, _max_slots.get(key, 0))
 
 
 @contextmanager
 def room_for(inputs: SplatInputs, slots: int) -> Iterator[None]:
     """Turn a lack of memory for so many slots into a ValueError that says why there are so many."""
-    if slots > _MOST_SLOTS:
+    if slots > _SLOT_LIMIT:
         raise _too_many(inputs, slots)
     try:
         yield
@@ -105,7 +107,7 @@ def settle(device: torch.device, num_images: int, size: tuple[int, int]) -> bool
     full, not_finite, most = notes.tolist()
     notes.zero_()
     key = device, num_images, size
-    _most[key] = max(most, _most.get(key, 0))
+    _max_slots[key] = max(most, _max_slots.get(key, 0))
     return bool(full or not_finite)
 
 

@@ -21,8 +21,10 @@ from .triton_function import triton_function
 _PARTS = tl.constexpr(4)
 # pixels whose loads are under way at once
 _UNROLL = tl.constexpr(2)
-# slots that a program adds at once, and columns of terms
-_SLOTS, _COLUMNS = 64, 8
+# slots that a program of `_reduce` adds at once
+_SLOTS = 64
+# columns of terms that it adds at once; the first of them hold the five moments
+_COLUMNS = 8
 
 
 def differentiate(plan: CudaPlan, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
@@ -158,9 +160,9 @@ def _reduce(
             sums += tl.sum(tl.load(terms + place, mask=in_terms, other=0.0).to(tl.float64), axis=0)
         sums = tl.where(failed, float("nan"), sums)
         if GEOMETRY and base == 0:
-            s1, s2 = _at(sums, column, 0) / SCALE, _at(sums, column, 1) / SCALE
-            s11, s12 = _at(sums, column, 2) / (SCALE * SCALE), _at(sums, column, 3) / (SCALE * SCALE)
-            s22 = _at(sums, column, 4) / (SCALE * SCALE)
+            s1, s2 = _column(sums, column, 0) / SCALE, _column(sums, column, 1) / SCALE
+            s11, s12 = _column(sums, column, 2) / (SCALE * SCALE), _column(sums, column, 3) / (SCALE * SCALE)
+            s22 = _column(sums, column, 4) / (SCALE * SCALE)
             l11 = tl.load(cholesky + 3 * g).to(tl.float64)
             l21 = tl.load(cholesky + 3 * g + 1).to(tl.float64)
             l22 = tl.load(cholesky + 3 * g + 2).to(tl.float64)
@@ -176,5 +178,5 @@ def _reduce(
 
 
 @triton.jit
-def _at(values, places, place):
-    return tl.sum(tl.where(places == place, values, 0.0), axis=0)
+def _column(sums, columns, column):
+    return tl.sum(tl.where(columns == column, sums, 0.0), axis=0)

@@ -23,8 +23,11 @@ from ..whitened import SCALE as EXPONENT_SCALE
 from .capacity import notes_of, remember, report, reports, reserve, room_for
 from .triton_function import triton_function
 
-# Gaussians per program of `_prepare`, and per step of a loop of `_bin` and `_tile`
-_PREPARE_BLOCK, _BIN_BLOCK, _TILE_BLOCK = 128, 1024, 128
+# Gaussians per program of `_prepare`
+_PREPARE_BLOCK = 128
+# Gaussians that a loop of `_bin` or `_tile` compares at once
+_BIN_BLOCK = 1024
+_TILE_BLOCK = 128
 
 # tiles along a side of an image: their numbers have 16 bits, of which one is the sign
 _MOST_TILES = (1 << 15) - 1
