@@ -182,7 +182,7 @@ def cut_windows(table: MapTable, places: Tensor, regions: Tensor, span: Sequence
     from .loops import cut_windows as cut
 
     windows = np.empty((len(regions), *span))
-    loop = partial(cut, *map(to_array, table.tiles), table.shape, to_array(places), to_array(regions), windows)
+    loop = partial(cut, tuple(map(to_array, table.tiles)), table.shape, to_array(places), to_array(regions), windows)
     run_tasks(loop, ranges(len(regions), _TASK_WINDOWS))
     return torch.from_numpy(windows)
 

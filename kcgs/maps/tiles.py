@@ -70,9 +70,11 @@ def _fill(table: MapTable, entries: tuple[Any, Any, Any], dtype: Any, smooth: An
     assert table.positions is not None
     weights = np.empty((_num_planes(entries), TILE * TILE), dtype)
     blurs = blurs_of((0.0,), table.positions.device) if table.blurs is None else table.blurs
-    arrays = to_array(table.positions), smooth, _width_array(table), to_array(blurs[:, 1:])
-    run_tasks(partial(fill_planes, *arrays, *entries, weights), ranges(len(entries[0]) - 1, _TASK_TILES))
-    return table.replace_tiles(map(torch.from_numpy, (*entries, weights)))
+    tiles = (*entries, weights)
+    width_blurs = _width_array(table), to_array(blurs[:, 1:])
+    loop = partial(fill_planes, to_array(table.positions), smooth, width_blurs, tiles)
+    run_tasks(loop, ranges(len(entries[0]) - 1, _TASK_TILES))
+    return table.replace_tiles(map(torch.from_numpy, tiles))
 
 
 def _width_array(table: MapTable) -> Any:
