@@ -14,7 +14,7 @@ from torch.utils.weak import WeakTensorKeyDictionary
 from .membership import Membership
 from .resampled import Resampled, SmoothMembership
 from .table import MapTable, with_positions
-from .tiles import complete
+from .tiles import with_tiles
 
 T = TypeVar("T")
 
@@ -60,4 +60,4 @@ def membership_at(table: MapTable, size: tuple[int, int]) -> Membership:
 
 def table_at(table: MapTable, size: tuple[int, int]) -> MapTable:
     """Return the table of a map at a size, with all that kernels read."""
-    return complete(table) if size == table.size else membership_at(table, size).tiled_table
+    return with_tiles(with_positions(table)) if size == table.size else membership_at(table, size).tiled_table

@@ -265,8 +265,7 @@ class RegionMap:
         """Return the map with a function applied to each of its tensors."""
         if self._source is not None:
             return self._source._with_tensors(function).resize(self.size)
-        table = MapTable._make(None if part is None else function(part) for part in self._table)
-        return RegionMap.__new__(RegionMap)._fill(table, self._softness)
+        return RegionMap.__new__(RegionMap)._fill(self._table.apply(function), self._softness)
 
     def __getitem__(self, index: int | slice) -> RegionMap:
         """Copy one map of a batch, or a slice of the batch, with only the regions that occur in it.

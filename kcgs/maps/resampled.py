@@ -42,7 +42,7 @@ class SmoothMembership(Membership):
 
     def __init__(self, source: Membership) -> None:
         """Take the map at its own size."""
-        table = MapTable(*(None if part is None else part.cpu() for part in source.table.without_tiles()))  # type: ignore[arg-type]
+        table = source.table.without_tiles().apply(Tensor.cpu)
         blurs = blurs_of([max(width, LEAST_BLUR) for width in source.widths], torch.device("cpu"))
         super().__init__(table._replace(blurs=blurs))
         self.source = source

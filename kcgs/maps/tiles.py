@@ -11,18 +11,13 @@ from torch import Tensor
 
 from .antialiasing import SmoothLabels
 from .device_tiles import tiles_on_device
-from .table import MapTable, with_positions
+from .table import MapTable
 from .tile import TILE
 from .widths import blurs_of, reach_of
 
 # tiles per task
 _TASK_TILES = 64
 _NONE = np.empty((0, 0, 0), np.int32)
-
-
-def complete(table: MapTable) -> MapTable:
-    """Return a table with all that kernels read."""
-    return with_tiles(with_positions(table))
 
 
 def with_tiles(table: MapTable, most_planes: int | None = None) -> MapTable:
@@ -82,5 +77,5 @@ def _width_array(table: MapTable) -> Any:
 
 
 def to_array(tensor: Tensor) -> Any:
-    """Return a tensor of any device as an array in C order."""
+    """Copy a tensor of any device to an array in C order, if it is not one already."""
     return tensor.cpu().contiguous().numpy()
