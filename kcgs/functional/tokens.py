@@ -11,7 +11,7 @@ from kcgs.errors import InvalidArgument
 from .covariance import check_cholesky
 
 # columns of a token besides the colours
-NUM_GEOMETRY = 5
+_NUM_GEOMETRY = 5
 
 
 def to_tokens(means: Tensor, cholesky: Tensor, colors: Tensor, size: tuple[int, int] | Tensor) -> Tensor:
@@ -57,14 +57,14 @@ def from_tokens(tokens: Tensor, size: tuple[int, int] | Tensor) -> tuple[Tensor,
         TypeError, ValueError: not a floating tensor; no column of a colour; a size that is not two positive integers.
     """
     tokens = check_floating("tokens", tokens, finite=False)
-    if tokens.ndim < 2 or tokens.shape[-1] <= NUM_GEOMETRY:
+    if tokens.ndim < 2 or tokens.shape[-1] <= _NUM_GEOMETRY:
         raise InvalidArgument("tokens", "5 + C columns", tuple(tokens.shape), verb="have")
     tokens = tokens.to(torch.promote_types(tokens.dtype, torch.float32))
     extent, side = _extent(tokens, size)
-    x, y, log11, slant, log22 = tokens[..., :NUM_GEOMETRY].unbind(-1)
+    x, y, log11, slant, log22 = tokens[..., :_NUM_GEOMETRY].unbind(-1)
     l11, l22 = torch.exp(log11) * side, torch.exp(log22) * side
     means = 0.5 * (torch.stack([x, y], -1) + 1.0) * extent
-    return means, torch.stack([l11, slant * (l11 + l22), l22], -1), tokens[..., NUM_GEOMETRY:]
+    return means, torch.stack([l11, slant * (l11 + l22), l22], -1), tokens[..., _NUM_GEOMETRY:]
 
 
 def _extent(table: Tensor, size: tuple[int, int] | Tensor) -> tuple[Tensor, Tensor]:

@@ -172,17 +172,12 @@ def _copy_plane(plane, weights, top, left, window):
 
 @program.entry
 def fill_planes(index, smooth, blurs, tiles, tasks, counters):
-    """Fill the membership of regions in the tiles of a `MapTable` that hold several regions. Tasks are ranges of tiles.
+    """Fill the membership of regions in the tiles of a `MapTable` that hold several regions.
 
-    Args:
-        index: position of each pixel's region among the sorted ids, (maps, H, W).
-        smooth: arrays of `SmoothLabels`; if they are not empty, they divide each pixel between its own label in `index`
-            and a neighbour's.
-        blurs: width of each pixel, empty where there is one width; and taps, of which row k is half of the blur for
-            pixels of width k, its centre first, then zeros.
-        tiles: `TILE_FIELDS` of the table; the last one, the weights, is filled.
-        tasks: of `run_tasks`.
-        counters: of `run_tasks`.
+    `tiles` has its `TILE_FIELDS`, of which `weights` is filled. `smooth` has the arrays of `SmoothLabels`; if they are
+    not empty, they divide each pixel between its label in `index` and a neighbour's. `blurs` has the width of each
+    pixel, empty where there is one width, and taps. Row k of taps is half of the blur for pixels of width k, its centre
+    first, then zeros. Tasks are ranges of tiles.
     """
     (width_index, taps), (starts, regions, planes, weights) = blurs, tiles
     _, height, width = index.shape
