@@ -9,14 +9,13 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import avg_pool2d, pad
 
 from kcgs._check import check_image
 from kcgs._labels import check_labels
 from kcgs._warn import warn_user
 from kcgs.maps import edge_band
 
-from .blur import halve
 from .similarity import SCALE_WEIGHTS, SSIM_WINDOW, mean_ssim
 
 # least side for MS-SSIM, whose coarsest scale then holds one window
@@ -100,7 +99,7 @@ def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
     product = torch.ones((), dtype=torch.float64, device=image.device)
     for weight in SCALE_WEIGHTS[:-1]:
         product = product * mean_ssim(image, target, contrast=True).relu() ** weight
-        image, target = halve(_make_even(image)), halve(_make_even(target))
+        image, target = _average_blocks(image), _average_blocks(target)
     product = product * mean_ssim(image, target).relu() ** SCALE_WEIGHTS[-1]
     return product.mean(1).to(image.dtype).reshape(batch_shape)
 
@@ -262,10 +261,10 @@ def _nan(name: str, image: Tensor, batch_shape: torch.Size, side: int) -> Tensor
     return image.new_full(batch_shape, math.nan)
 
 
-def _make_even(image: Tensor) -> Tensor:
-    """Repeat an odd last row or column."""
+def _average_blocks(image: Tensor) -> Tensor:
+    """Average blocks of 2 x 2 pixels; unlike `halve`, repeat an odd last row or column."""
     height, width = image.shape[-2:]
-    return pad(image, (0, width % 2, 0, height % 2), mode="replicate")
+    return avg_pool2d(pad(image, (0, width % 2, 0, height % 2), mode="replicate"), 2)
 
 
 def _ppm(image: Tensor) -> BytesIO:
