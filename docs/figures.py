@@ -39,8 +39,8 @@ def membership(path: Path) -> None:
     labels = (torch.arange(SIZE[1]) >= SIZE[1] // 2).long().expand(SIZE).contiguous()
     renders: dict[str, Tensor] = {
         "without regions": region_splat(means, cholesky, colors, size=SIZE),
-        "hard contour": region_splat(means, cholesky, colors, ids, RegionMap.from_labels(labels)),
-        "soft contour": region_splat(means, cholesky, colors, ids, RegionMap.from_labels(labels, softness=SOFTNESS)),
+        "hard contour": region_splat(means, cholesky, colors, ids, RegionMap(labels)),
+        "soft contour": region_splat(means, cholesky, colors, ids, RegionMap(labels, softness=SOFTNESS)),
     }
     figure, axes = plt.subplots(
         2, 3, figsize=(9, 3.6), layout="constrained", sharex=True, height_ratios=(2, 1), squeeze=False

@@ -95,13 +95,13 @@ def choose_softness(
         >>> choose_softness(0.2 + 0.5 * labels[None], labels)
         {(0, 1): 0.0}
     """
-    levels = _check_candidates(candidates)
-    windows, parts = _measure(image, labels, levels)
+    candidates = _check_candidates(candidates)
+    windows, parts = _measure(image, labels, candidates)
     errors = parts.sum_pairs(windows)
     tie = _TIE * errors.weight
-    pooled = _best_softness(errors.soft.sum(0).tolist(), float(tie.sum()), levels)
+    pooled = _best_softness(errors.soft.sum(0).tolist(), float(tie.sum()), candidates)
     return {
-        (a, b): _best_softness(errors.soft[p].tolist(), float(tie[p]), levels) if reliable else pooled
+        (a, b): _best_softness(errors.soft[p].tolist(), float(tie[p]), candidates) if reliable else pooled
         for p, (a, b, reliable) in enumerate(_pairs(windows, errors))
     }
 
@@ -150,30 +150,31 @@ def _pairs(windows: _Windows, errors: _Errors) -> list[tuple[int, int, bool]]:
     return [(a, b, enough) for (a, b), enough in zip(windows.pairs.tolist(), reliable.tolist(), strict=True)]
 
 
-def _best_softness(error: list[float], tie: float, levels: Sequence[float]) -> float:
+def _best_softness(error: list[float], tie: float, candidates: Sequence[float]) -> float:
+    """Return the first candidate whose error is within `tie` of the least, refined between its neighbours."""
     least = min(error)
     best = next(i for i, e in enumerate(error) if e <= least + tie)
-    if best in (0, len(error) - 1) or error[best] > least or levels[best - 1] == 0.0:
-        return levels[best]
+    if best in (0, len(error) - 1) or error[best] > least or candidates[best - 1] == 0.0:
+        return candidates[best]
     # two edges blurred by v and w differ by about (sqrt(v) - sqrt(w))^2, summed over pixels, if neither is near 0
-    (x0, x1, x2), (y0, y1, y2) = map(math.sqrt, levels[best - 1 : best + 2]), error[best - 1 : best + 2]
+    (x0, x1, x2), (y0, y1, y2) = map(math.sqrt, candidates[best - 1 : best + 2]), error[best - 1 : best + 2]
     left, right = (x1 - x0) * (y2 - y1), (x2 - x1) * (y0 - y1)
     if left + right <= tie:
-        return levels[best]
+        return candidates[best]
     vertex = x1 + 0.5 * ((x2 - x1) * right - (x1 - x0) * left) / (left + right)
     return round(round(vertex**2 / _STEP) * _STEP, 6)
 
 
-def _measure(image: Tensor, labels: Tensor, levels: Sequence[float]) -> tuple[_Windows, _Errors]:
+def _measure(image: Tensor, labels: Tensor, candidates: Sequence[float]) -> tuple[_Windows, _Errors]:
     """Check image and labels, place the windows, and return each window's errors at each softness, ascending."""
     image, labels = check_image_and_labels(image, labels)
     windows = _place_windows(labels)
-    half, halo = max(_HALF, math.ceil(2 * levels[-1])), math.ceil(RADIUS_SIGMAS * levels[-1])
+    half, halo = max(_HALF, math.ceil(2 * candidates[-1])), math.ceil(RADIUS_SIGMAS * candidates[-1])
     side, span = 2 * half + 1, 2 * (half + halo) + 1
     windowed = torch.nn.functional.pad(image, (half,) * 4).unfold(1, side, 1).unfold(2, side, 1)
     labels = torch.nn.functional.pad(labels.to(image.device), (half + halo,) * 4, value=-1)
     ids = labels.unfold(0, span, 1).unfold(1, span, 1)
-    kernels = [_blur_matrix(softness, side, halo).to(image) for softness in levels]
+    kernels = [_blur_matrix(softness, side, halo).to(image) for softness in candidates]
     parts = []
     step = max(1, (_GPU_CHUNK_ELEMENTS if image.is_cuda else _CHUNK_ELEMENTS) // span**2)
     for centers, pair in zip(windows.centers.split(step), windows.pair.split(step), strict=True):

@@ -17,7 +17,7 @@ def check_cholesky(name: str, value: object) -> Tensor:
     """Return `value` if it is a finite (..., 3) tensor with positive l11 and l22."""
     cholesky = check_floating(name, value, last=3)
     if not verify((cholesky[..., ::2] > 0).all(), f"{name} must have l11 > 0 and l22 > 0"):
-        least = f"a least of {float(cholesky[..., ::2].min()):g}"
+        least = f"a least of {cholesky[..., ::2].min().item():g}"
         hint = "kcgs.functional.activate_gaussians makes a network's output valid"
         raise InvalidArgument(name, "l11 > 0 and l22 > 0", f"{least}; {hint}", verb="have")
     return cholesky
@@ -94,7 +94,7 @@ def scale_rotation_to_cholesky(scales: Tensor, angle: Tensor) -> Tensor:
     scales = check_floating("scales", scales, last=2)
     angle = check_floating("angle", angle)
     if not (scales > 0).all():
-        raise ValueError(f"scales must be positive; got a least of {float(scales.min()):g}")
+        raise ValueError(f"scales must be positive; got a least of {scales.min().item():g}")
     if scales.shape[:-1] != angle.shape:
         raise ValueError(f"angle must have shape {tuple(scales.shape[:-1])}; got {tuple(angle.shape)}")
     s1, s2 = scales.unbind(-1)

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from kcgs._check import check_number
 from kcgs._labels import check_labels
+from kcgs.errors import InvalidArgument
 
 from .contour_fit import check_image_and_labels, contour_gain
 
@@ -32,7 +33,8 @@ def merge_regions(
         image: :math:`(C, H, W)` floating in [0, 1].
         labels: :math:`(H, W)` integer, non-negative.
         merge_cost: squared error that a pixel of contour must save, at least 0.
-        objects: :math:`(H, W)` integer, a coarser map: regions of two objects do not merge; None: all may.
+        objects: :math:`(H, W)` integer, a coarser map: regions of two objects do not merge, and none lies in two;
+            None: all may merge.
 
     Returns:
         :math:`(H, W)` int64; merged regions have the id of one of them.
@@ -57,6 +59,9 @@ def merge_regions(
         if objects.shape != labels.shape:
             raise ValueError(f"objects must have shape {tuple(labels.shape)}; got {tuple(objects.shape)}")
         owners[labels] = objects
+        if (crossing := owners[labels] != objects).any():
+            received = f"a contour through the region {int(ids[labels[crossing][0]])}"
+            raise InvalidArgument("objects", "a map that labels divide further", received)
     for _ in range(_ROUNDS):
         gains = contour_gain(image, labels)
         saved = {

@@ -99,7 +99,7 @@ def ms_ssim(image: Tensor, target: Tensor) -> Tensor:
     product = torch.ones((), dtype=torch.float64, device=image.device)
     for weight in SCALE_WEIGHTS[:-1]:
         product = product * mean_ssim(image, target, contrast=True).relu() ** weight
-        image, target = _halve(image), _halve(target)
+        image, target = _average_blocks(image), _average_blocks(target)
     product = product * mean_ssim(image, target).relu() ** SCALE_WEIGHTS[-1]
     return product.mean(1).to(image.dtype).reshape(batch_shape)
 
@@ -261,7 +261,8 @@ def _nan(name: str, image: Tensor, batch_shape: torch.Size, side: int) -> Tensor
     return image.new_full(batch_shape, math.nan)
 
 
-def _halve(image: Tensor) -> Tensor:
+def _average_blocks(image: Tensor) -> Tensor:
+    """Average blocks of 2 x 2 pixels; unlike `halve`, repeat an odd last row or column."""
     height, width = image.shape[-2:]
     return avg_pool2d(pad(image, (0, width % 2, 0, height % 2), mode="replicate"), 2)
 

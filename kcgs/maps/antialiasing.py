@@ -14,14 +14,14 @@ from torch.nn.functional import max_pool2d, pad
 
 # pixels along a straight piece of contour within which its ends are looked for
 _SEARCH = 32
-# the weight of a pixel on a line one pixel wide is multiplied by _LINE_SUM / own - 1, where `own` is the share of its
-# label around it, in sixteenths
+# the weight of a pixel on a line one pixel wide is multiplied by _LINE_SUM / sixteenths - 1; `sixteenths` are the share
+# of the pixel's label in the 3 x 3 pixels around it, of which a side counts twice a corner, and the middle four times
 _LINE_SUM = 21.6
-_LINE = 8  # largest `own` of a pixel that counts as part of a line one pixel wide
+_LINE = 8  # most sixteenths of a pixel that counts as part of a line one pixel wide
 
 
 class SmoothLabels(NamedTuple):
-    """The weights of two labels in each pixel, (B, H, W): of its own, and of one neighbour's."""
+    """The weights of two labels in each pixel, (B, H, W): of the pixel's label, and of one neighbour's."""
 
     weight: Tensor  # float64, of its own label
     other: Tensor  # label of the neighbour
@@ -37,7 +37,7 @@ def antialias(labels: Tensor, is_sharp: Tensor) -> SmoothLabels:
     where there is no step, and the middle of the piece. A straight contour of any slope becomes straight. If two
     neighbours take a part of a pixel, the neighbour that takes more counts.
     """
-    share, own = torch.zeros_like(labels, dtype=torch.float64), torch.zeros_like(labels)
+    share, sixteenths = torch.zeros_like(labels, dtype=torch.float64), torch.zeros_like(labels)
     other = labels
     for is_column in (False, True):
         image = labels.mT if is_column else labels
@@ -48,8 +48,9 @@ def antialias(labels: Tensor, is_sharp: Tensor) -> SmoothLabels:
             part, neighbour = (p.mT for p in parts) if is_column else parts
             other, share = torch.where(part > share, neighbour, other), torch.maximum(share, part)
     for down, right in product((-1, 0, 1), (-1, 0, 1)):
-        own = own + (2 - down * down) * (2 - right * right) * (shifted(labels, down, right) == labels)
-    gain = torch.where((own <= _LINE) & is_sharp, _LINE_SUM / own - 1, torch.ones_like(share))
+        is_same = shifted(labels, down, right) == labels
+        sixteenths = sixteenths + (2 - down * down) * (2 - right * right) * is_same
+    gain = torch.where((sixteenths <= _LINE) & is_sharp, _LINE_SUM / sixteenths - 1, torch.ones_like(share))
     return SmoothLabels((1 - share) * gain, other, share)
 
 
@@ -73,8 +74,8 @@ def _ends(image: Tensor) -> tuple[Tensor, Tensor]:
     column = torch.arange(image.shape[-1], device=image.device)
     ends = torch.where(goes_on, -1, 3 * column + 1 + up.long() - down.long())
     nearest = max_pool2d(pad(ends.float(), (_SEARCH - 1, 0), value=-1.0), (1, _SEARCH), 1).long()
-    found = nearest >= 0
-    return torch.where(found, column - nearest // 3, _SEARCH), torch.where(found, nearest % 3 - 1, 0)
+    is_end = nearest >= 0
+    return torch.where(is_end, column - nearest // 3, _SEARCH), torch.where(is_end, nearest % 3 - 1, 0)
 
 
 def shifted(image: Tensor, down: int, right: int) -> Tensor:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from kcgs._labels import check_labels, is_label_source
 
-from .regions import RegionMap, wrap_labels
+from .regions import RegionMap
 from .table import MapTable
 
 
@@ -17,9 +16,7 @@ def as_region_map(value: object, name: str = "regions") -> RegionMap | None:
     if value is None or isinstance(value, RegionMap):
         return value
     if is_label_source(value):
-        labels = check_labels(name, value)
-        with torch.inference_mode(False):  # autograd saves no tensor of inference mode
-            return wrap_labels(labels.clone(), 0.0)
+        return RegionMap(check_labels(name, value))
     raise TypeError(f"{name} must be a RegionMap, a label map or None; got {type(value).__name__}")
 
 
@@ -30,5 +27,5 @@ def table_and_size(regions: object) -> tuple[MapTable, tuple[int, int]]:
     if isinstance(regions, (Tensor, np.ndarray)):  # graphs of torch 2.7 know no other form
         table = MapTable(check_labels("regions", regions, values=False))
         return table, table.size
-    hint = ": RegionMap.from_labels reads it, once for all renders" if is_label_source(regions) else ""
+    hint = ": RegionMap(regions) reads it, once for all renders" if is_label_source(regions) else ""
     raise TypeError(f"regions must be a RegionMap, a Tensor, an array or None; got {type(regions).__name__}{hint}")

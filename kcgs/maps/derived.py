@@ -6,6 +6,7 @@ alone, whose table has no `starts`, are not kept.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -14,7 +15,7 @@ from torch.utils.weak import WeakTensorKeyDictionary
 from .membership import Membership
 from .resampled import Resampled, SmoothMembership
 from .table import MapTable, with_positions
-from .tiles import complete
+from .tiles import with_tiles
 
 T = TypeVar("T")
 
@@ -37,27 +38,18 @@ def derive(table: MapTable, make: Callable[[MapTable], T]) -> T:
     return result
 
 
-class _Sizes:
-    """The memberships of a map at the few sizes other than its own that were added last."""
-
-    def __init__(self, table: MapTable) -> None:
-        self._smooth = SmoothMembership(Membership(table.without_tiles()))
-        self._sizes: dict[tuple[int, int], Resampled] = {}
-
-    def at(self, size: tuple[int, int]) -> Resampled:
-        sizes = self._sizes
-        if size not in sizes:
-            # a new dict: another thread may read the present one
-            self._sizes = sizes = dict([*sizes.items(), (size, Resampled(self._smooth, size))][-_KEPT_SIZES:])
-        return sizes[size]
+def _resampler(table: MapTable) -> Callable[[tuple[int, int]], Resampled]:
+    """Return a function that makes the membership of a map at another size, and keeps a few."""
+    smooth = SmoothMembership(Membership(table.without_tiles()))
+    return functools.lru_cache(_KEPT_SIZES)(functools.partial(Resampled, smooth))
 
 
 def membership_at(table: MapTable, size: tuple[int, int]) -> Membership:
     """Return the membership of a map at a size, by its definition."""
     table = with_positions(table)
-    return Membership(table) if size == table.size else derive(table, _Sizes).at(size)
+    return Membership(table) if size == table.size else derive(table, _resampler)(size)
 
 
 def table_at(table: MapTable, size: tuple[int, int]) -> MapTable:
     """Return the table of a map at a size, with all that kernels read."""
-    return complete(table) if size == table.size else membership_at(table, size).tiled_table
+    return with_tiles(with_positions(table)) if size == table.size else membership_at(table, size).tiled_table

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcgs._check import check_floating
+from kcgs._check import check_floating, check_number
 from kcgs._labels import check_labels
 from kcgs._rows import row_slices
 
@@ -79,8 +79,7 @@ def edge_band(labels: Tensor, width: float = 5) -> Tensor:
     Source: the paper's edge-focused evaluation (5 pixels inward and outward).
     """
     labels = check_labels("labels", labels)
-    if not (1 <= width < math.inf):
-        raise ValueError(f"width must be a finite number of at least 1 pixel; got {width!r}")
+    check_number("width", width, 1.0, unit="pixels")
     height, breadth = labels.shape[-2:]
     band = torch.zeros_like(labels, dtype=torch.uint8)  # not bool: inductor's C++ for slices of bool does not compile
     width = min(width, math.hypot(height, breadth))

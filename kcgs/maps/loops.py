@@ -138,11 +138,13 @@ def _insert(values, first, end, value):
 
 
 @program.entry
-def cut_windows(starts, regions, planes, weights, shape, places, members, windows, tasks, counters):
+def cut_windows(tiles, shape, places, members, windows, tasks, counters):
     """Fill the membership of regions, (P,), over windows, (P, h, w), at places, (P, 3), out of a `MapTable`.
 
-    `shape` is that of `list_window_regions`; membership is 0 beyond the tiles. Tasks are ranges of windows.
+    `tiles` has its `TILE_FIELDS`; `shape` is that of `list_window_regions`; membership is 0 beyond the tiles. Tasks are
+    ranges of windows.
     """
+    starts, regions, planes, weights = tiles
     rows, cols = (shape[1] + SIDE - 1) // SIDE, (shape[2] + SIDE - 1) // SIDE
     height, width = windows.shape[1:]
     task = first_task(tasks, counters)
@@ -169,13 +171,15 @@ def _copy_plane(plane, weights, top, left, window):
 
 
 @program.entry
-def fill_planes(index, smooth, width_index, taps, starts, regions, planes, weights, tasks, counters):
+def fill_planes(index, smooth, blurs, tiles, tasks, counters):
     """Fill the membership of regions in the tiles of a `MapTable` that hold several regions.
 
-    `smooth` has the arrays of `SmoothLabels`; if they are not empty, they divide each pixel between its own label in
-    `index` and a neighbour's. Row k of taps is half of the blur for pixels of width k, its centre first, then zeros;
-    `width_index` is empty where there is one width. Tasks are ranges of tiles.
+    `tiles` has its `TILE_FIELDS`, of which `weights` is filled. `smooth` has the arrays of `SmoothLabels`; if they are
+    not empty, they divide each pixel between its label in `index` and a neighbour's. `blurs` has the width of each
+    pixel, empty where there is one width, and taps. Row k of taps is half of the blur for pixels of width k, its centre
+    first, then zeros. Tasks are ranges of tiles.
     """
+    (width_index, taps), (starts, regions, planes, weights) = blurs, tiles
     _, height, width = index.shape
     rows, cols = (height + SIDE - 1) // SIDE, (width + SIDE - 1) // SIDE
     side = SIDE + 2 * (taps.shape[1] - 1)

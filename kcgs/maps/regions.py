@@ -8,32 +8,25 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from kcgs._check import check_size
+from kcgs._check import check_integer, check_size
 from kcgs._labels import check_labels
 from kcgs.errors import InvalidArgument
 
 from .derived import table_at
-from .labels import compact, positions_of, sample_labels, union_find
+from .labels import positions_of, sample_labels, union_find
 from .softness import (
     GivenSoftness,
     Softness,
-    check_softness,
     extended_softness,
     for_each,
     merged_softness,
     scaled_softness,
-    softness_by_position,
     softness_from_plain,
     softness_of_labels,
     softness_to_plain,
 )
 from .table import MapTable, full_map
-from .tiles import with_tiles
-from .widths import blurs_of, find_widths
-
-# largest number of planes that a map keeps, 1 GiB; every render makes the tiles of a larger map, as a small file of
-# noise may hold
-_MOST_PLANES = 1 << 20
+from .table_of_labels import table_of_labels
 
 
 class RegionMap:
@@ -50,12 +43,6 @@ class RegionMap:
         >>> regions.num_regions, regions.size, regions.softness
         (2, (2, 3), 0.0)
     """
-
-    _labels: Tensor
-    _softness: Softness
-    _index: Tensor  # [maps, H, W] int32
-    _table: MapTable  # of the map, or of the map that it was interpolated from
-    _source: RegionMap | None  # the map that this one was interpolated from
 
     def __init__(self, labels: Any, softness: GivenSoftness = 0.0) -> None:
         r"""Make a map of labels.
@@ -78,18 +65,15 @@ class RegionMap:
             0.7
         """
         with torch.inference_mode(False):  # autograd saves no tensor of inference mode
-            self._fill(check_labels("labels", labels).clone(), softness)
+            self._fill(*table_of_labels(check_labels("labels", labels).clone(), softness))
 
-    def _fill(self, labels: Tensor, softness: GivenSoftness) -> None:
-        """Derive all that renders read."""
-        self._labels, self._source = labels, None
-        ids, index = compact(labels)
-        self._index = index if index.ndim == 3 else index[None]
-        self._softness = check_softness(softness, ids, self._index, labels.ndim == 3)
-        by_position = for_each(self._softness, lambda one: softness_by_position(one, ids))
-        widths, pixels = find_widths(self._index, len(ids), by_position)
-        blurs = None if widths == (0.0,) else blurs_of(widths, labels.device)
-        self._table = with_tiles(MapTable(labels, blurs, pixels, ids, self._index), _MOST_PLANES)
+    def _fill(self, table: MapTable, softness: Softness) -> RegionMap:
+        """Take a table at its own size; return the map."""
+        assert table.positions is not None
+        self._labels, self._index, self._softness = table.labels, table.positions, softness
+        self._table = table  # that of the source, where there is one
+        self._source: RegionMap | None = None  # the map that a resized map interpolates
+        return self
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle no derived tensors: torch moves the memory of each tensor that it sends to another process."""
@@ -105,7 +89,7 @@ class RegionMap:
 
     @classmethod
     def from_labels(cls, labels: Any, softness: GivenSoftness = 0.0) -> RegionMap:
-        """Return RegionMap(labels, softness)."""
+        """Return RegionMap(labels, softness): new code calls the constructor, older code keeps this name."""
         return cls(labels, softness)
 
     @property
@@ -116,9 +100,8 @@ class RegionMap:
     @property
     def ids(self) -> Tensor:
         """The distinct ids, (R,) int64, sorted; the map's own, not to be written to."""
-        ids = self._table.ids
-        assert ids is not None
-        return ids
+        assert self._table.ids is not None
+        return self._table.ids
 
     @property
     def softness(self) -> Softness:
@@ -156,20 +139,21 @@ class RegionMap:
         return self._source is not None
 
     def index_of(self, region_ids: Tensor) -> Tensor:
-        """Return the position of each id among `ids`, -1 where the map does not hold it."""
-        return positions_of(region_ids, self.ids)
+        """Return the position of each id, integers, among `ids`, -1 where the map does not hold it."""
+        return positions_of(check_integer("region_ids", region_ids), self.ids)
 
     def membership(self, region_ids: int | Iterable[int] | Tensor, dtype: torch.dtype = torch.float64) -> Tensor:
         r"""Evaluate the membership of every pixel in a region, or the sum over several.
 
         Args:
             region_ids: an id, or several; ids that the map does not hold have no pixels.
-            dtype: of the result; sums are taken in float64.
+            dtype: of the result.
 
         Returns:
             :math:`(H, W)`, in [0, 1] up to rounding.
 
         Raises:
+            TypeError: ids that are no integers.
             ValueError: a batch of maps.
 
         Example:
@@ -180,37 +164,38 @@ class RegionMap:
         if self.num_maps is not None:
             raise ValueError(f"membership needs one map; got a batch of {self.num_maps}")
         if not isinstance(region_ids, Tensor):
-            region_ids = torch.tensor([*region_ids] if isinstance(region_ids, Iterable) else [region_ids])
-        places = self.index_of(region_ids.long().flatten().unique().to(self.ids.device)).tolist()
+            several = [*region_ids] if isinstance(region_ids, Iterable) else [region_ids]
+            region_ids = torch.tensor(several) if several else self.ids[:0]
+        places = self.index_of(region_ids.flatten().unique().to(self.ids.device)).tolist()
         table = table_at(self._table, self.size)
-        parts = [full_map(table, 0, place) for place in places if place >= 0]
         black = torch.zeros(self.size, dtype=torch.float64, device=self.ids.device)
-        return (sum(parts[1:], parts[0]) if parts else black).to(dtype)
+        return sum((full_map(table, 0, place) for place in places if place >= 0), black).to(dtype)
 
     @classmethod
     def stack(cls, maps: Sequence[RegionMap]) -> RegionMap:
         """Make a batch of maps of one image each; each keeps its softness, and ``batch[k]`` returns map k.
 
         Args:
-            maps: at least one, all of one size.
+            maps: at least one, all of one size; resized maps also of one size before.
 
         Raises:
-            ValueError: no maps, batches, or maps of several sizes.
+            ValueError: no maps, batches, or maps of several sizes, now or before they were resized.
 
         Example:
             >>> batch = RegionMap.stack([RegionMap(torch.tensor([[1, 2]]), 0.5), RegionMap(torch.tensor([[7, 7]]))])
             >>> batch.labels.shape, batch.softness
             (torch.Size([2, 1, 2]), (0.5, 0.0))
         """
-        sizes = {(one.num_maps, one.size) for one in maps}
+        sources = [one._source or one for one in maps]
+        sizes = {(one.num_maps, one.size, source.size) for one, source in zip(maps, sources, strict=True)}
         if len(sizes) != 1 or maps[0].num_maps is not None:
-            raise InvalidArgument("maps", "at least one, each of one image and all of one size", sizes or "none")
-        return cls(torch.stack([one._labels for one in maps]), [one._softness for one in maps])  # type: ignore[misc]
+            expected = "at least one, each of one image, all of one size and resized from one size"
+            raise InvalidArgument("maps", expected, sizes or "none")
+        softness: Any = [one._softness for one in sources]
+        return cls(torch.stack([one._labels for one in sources]), softness).resize(maps[0].size)
 
     def relabel(self, labels: Tensor, new_contours: Literal["hard", "mean"] = "hard") -> RegionMap:
-        r"""Make the map of other labels, with the softness of this map.
-
-        Where pairs of regions have a softness, pairs whose ids remain keep theirs.
+        r"""Make the map of other labels, with the softness of this map; pairs whose ids remain keep theirs.
 
         Args:
             labels: integer, the shape of `labels`.
@@ -218,7 +203,7 @@ class RegionMap:
                 all pairs ("mean"). Ignored where all contours have one softness.
 
         Raises:
-            TypeError, ValueError: as :meth:`from_labels`; labels of another shape.
+            TypeError, ValueError: as the constructor; labels of another shape; another `new_contours`.
 
         Example:
             >>> regions = RegionMap(torch.tensor([[1, 1, 2, 5]]), {(1, 2): 0.7})
@@ -228,6 +213,8 @@ class RegionMap:
         labels = check_labels("labels", labels)
         if labels.shape != self._labels.shape:
             raise ValueError(f"labels must have shape {tuple(self._labels.shape)}; got {tuple(labels.shape)}")
+        if new_contours not in ("hard", "mean"):
+            raise InvalidArgument("new_contours", "'hard' or 'mean'", repr(new_contours))
         if not self._labels.is_cpu:  # the host would wait for the device at every step
             return self.to("cpu").relabel(labels.cpu(), new_contours).to(self._labels.device)
         softness: Any = self._softness
@@ -252,6 +239,9 @@ class RegionMap:
             >>> regions.labels, new_ids
             (tensor([[1, 4, 4]]), tensor([1, 4, 4]))
         """
+        if self._source is not None:
+            merged, new_ids = self._source.merge(pairs)
+            return merged and merged.resize(self.size), new_ids
         merged_id = union_find(self.ids.tolist(), pairs)
         new_ids = torch.tensor([merged_id(region) for region in self.ids.tolist()], device=self.ids.device)
         if len(new_ids.unique()) == 1:
@@ -261,8 +251,7 @@ class RegionMap:
 
     def to(self, device: torch.device | str) -> RegionMap:
         """Return the map on another device."""
-        device = torch.device(device)
-        return self if device == self.device else self._with_tensors(lambda tensor: tensor.to(device))
+        return self if torch.device(device) == self.device else self._with_tensors(lambda tensor: tensor.to(device))
 
     def cuda(self) -> RegionMap:
         """Return the map on the current CUDA device."""
@@ -276,12 +265,7 @@ class RegionMap:
         """Return the map with a function applied to each of its tensors."""
         if self._source is not None:
             return self._source._with_tensors(function).resize(self.size)
-        regions = RegionMap.__new__(RegionMap)
-        table = regions._table = MapTable._make(None if part is None else function(part) for part in self._table)
-        assert table.positions is not None
-        regions._labels, regions._index = table.labels, table.positions
-        regions._softness, regions._source = self._softness, None
-        return regions
+        return RegionMap.__new__(RegionMap)._fill(self._table.apply(function), self._softness)
 
     def __getitem__(self, index: int | slice) -> RegionMap:
         """Copy one map of a batch, or a slice of the batch, with only the regions that occur in it.
@@ -325,7 +309,7 @@ class RegionMap:
             >>> RegionMap.from_state(RegionMap(torch.tensor([[1, 2]])).state())
             RegionMap(2 regions, size=(1, 2), softness=0.0)
         """
-        return cls.from_labels(state["labels"], softness_from_plain(state["softness"])).resize(state["size"])
+        return cls(state["labels"], softness_from_plain(state["softness"])).resize(state["size"])
 
     def resize(self, size: tuple[int, int]) -> RegionMap:
         r"""Sample the map at another resolution; contours are smooth curves, not stairs.
@@ -352,16 +336,14 @@ class RegionMap:
             return self
         if self._source is not None:
             return self._source.resize((height, width))
-        regions = RegionMap.__new__(RegionMap)
-        regions._labels, regions._index = (sample_labels(t, height, width) for t in (self._labels, self._index))
-        regions._table, regions._source = self._table, self
         ratio = height * width / (self.size[0] * self.size[1])
-        regions._softness = for_each(self._softness, lambda one: scaled_softness(one, ratio))
+        softness = for_each(self._softness, lambda one: scaled_softness(one, ratio))
+        regions = RegionMap.__new__(RegionMap)._fill(self._table, softness)
+        regions._labels, regions._index = (sample_labels(t, height, width) for t in (self._labels, self._index))
+        regions._source = self
         return regions
 
 
 def wrap_labels(labels: Tensor, softness: GivenSoftness) -> RegionMap:
     """Make the map of valid int64 labels without a copy; the caller must not write to them."""
-    regions = RegionMap.__new__(RegionMap)
-    regions._fill(labels, softness)
-    return regions
+    return RegionMap.__new__(RegionMap)._fill(*table_of_labels(labels, softness))

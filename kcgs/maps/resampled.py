@@ -42,7 +42,7 @@ class SmoothMembership(Membership):
 
     def __init__(self, source: Membership) -> None:
         """Take the map at its own size."""
-        table = MapTable(*(None if part is None else part.cpu() for part in source.table.without_tiles()))  # type: ignore[arg-type]
+        table = source.table.without_tiles().apply(Tensor.cpu)
         blurs = blurs_of([max(width, LEAST_BLUR) for width in source.widths], torch.device("cpu"))
         super().__init__(table._replace(blurs=blurs))
         self.source = source
@@ -182,7 +182,7 @@ def cut_windows(table: MapTable, places: Tensor, regions: Tensor, span: Sequence
     from .loops import cut_windows as cut
 
     windows = np.empty((len(regions), *span))
-    loop = partial(cut, *map(to_array, table.tiles), table.shape, to_array(places), to_array(regions), windows)
+    loop = partial(cut, tuple(map(to_array, table.tiles)), table.shape, to_array(places), to_array(regions), windows)
     run_tasks(loop, ranges(len(regions), _TASK_WINDOWS))
     return torch.from_numpy(windows)
 

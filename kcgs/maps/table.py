@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import torch
@@ -63,6 +63,10 @@ class MapTable(NamedTuple):
         starts, regions, planes, weights = self.starts, self.regions, self.planes, self.weights
         assert starts is not None and regions is not None and planes is not None and weights is not None
         return starts, regions, planes, weights
+
+    def apply(self, function: Callable[[Tensor], Tensor]) -> MapTable:
+        """Return the table with a function applied to each of its tensors."""
+        return MapTable._make(None if part is None else function(part) for part in self)
 
     def replace_tiles(self, tiles: Iterable[Tensor | None]) -> MapTable:
         """Return the table with other tiles, in the order of `TILE_FIELDS`."""

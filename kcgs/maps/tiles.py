@@ -11,18 +11,13 @@ from torch import Tensor
 
 from .antialiasing import SmoothLabels
 from .device_tiles import tiles_on_device
-from .table import MapTable, with_positions
+from .table import MapTable
 from .tile import TILE
 from .widths import blurs_of, reach_of
 
 # tiles per task
 _TASK_TILES = 64
 _NONE = np.empty((0, 0, 0), np.int32)
-
-
-def complete(table: MapTable) -> MapTable:
-    """Return a table with all that kernels read."""
-    return with_tiles(with_positions(table))
 
 
 def with_tiles(table: MapTable, most_planes: int | None = None) -> MapTable:
@@ -70,9 +65,11 @@ def _fill(table: MapTable, entries: tuple[Any, Any, Any], dtype: Any, smooth: An
     assert table.positions is not None
     weights = np.empty((_num_planes(entries), TILE * TILE), dtype)
     blurs = blurs_of((0.0,), table.positions.device) if table.blurs is None else table.blurs
-    arrays = to_array(table.positions), smooth, _width_array(table), to_array(blurs[:, 1:])
-    run_tasks(partial(fill_planes, *arrays, *entries, weights), ranges(len(entries[0]) - 1, _TASK_TILES))
-    return table.replace_tiles(map(torch.from_numpy, (*entries, weights)))
+    tiles = (*entries, weights)
+    width_blurs = _width_array(table), to_array(blurs[:, 1:])
+    loop = partial(fill_planes, to_array(table.positions), smooth, width_blurs, tiles)
+    run_tasks(loop, ranges(len(entries[0]) - 1, _TASK_TILES))
+    return table.replace_tiles(map(torch.from_numpy, tiles))
 
 
 def _width_array(table: MapTable) -> Any:
@@ -80,5 +77,5 @@ def _width_array(table: MapTable) -> Any:
 
 
 def to_array(tensor: Tensor) -> Any:
-    """Return a tensor of any device as an array in C order."""
+    """Copy a tensor of any device to an array in C order, if it is not one already."""
     return tensor.cpu().contiguous().numpy()

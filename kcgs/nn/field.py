@@ -21,7 +21,7 @@ from kcgs._check import (
 from kcgs._labels import check_labels
 from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument, InvalidArgumentType
-from kcgs.functional import NUM_GEOMETRY, RegionMap, check_cholesky, from_tokens, lookup_regions, to_tokens
+from kcgs.functional import RegionMap, check_cholesky, from_tokens, lookup_regions, to_tokens
 
 _HALF = (torch.float16, torch.bfloat16)
 
@@ -276,9 +276,7 @@ class GaussianField(nn.Module):
             TypeError, ValueError: as the field; fewer than 6 columns.
         """
         check_floating("tokens", tokens, dims=(2, 3))
-        if tokens.shape[-1] <= NUM_GEOMETRY:
-            raise InvalidArgument("tokens", "5 + C columns", tuple(tokens.shape), verb="have")
-        return cls(*from_tokens(tokens, check_size("size", size)), region_ids, size=size)
+        return cls(*from_tokens(tokens, size), region_ids, size=size)
 
     def hflip(self) -> GaussianField:
         """Return the field of the image that is flipped left to right, exactly, with the graph.

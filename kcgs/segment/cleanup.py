@@ -119,9 +119,7 @@ class Cleanup:
         regions = merge_small(regions, self.min_pixels(regions.size))
         # connect after merging: a merged piece can join the two pieces of a region on its sides
         regions = order_by_area(connect(regions) if self.connected else regions)
-        if self.max_regions is not None and regions.max() >= self.max_regions:
-            regions = order_by_area(merge_similar(rgb_to_lab(image), regions, self.max_regions))
-        return regions
+        return order_by_area(merge_similar(image, regions, self.max_regions))
 
 
 def connect(labels: Labels) -> Labels:
@@ -172,14 +170,16 @@ def merge_small(labels: Labels, min_size: int, objects: Labels | None = None) ->
     return label_of_piece[graph.roots()][pieces]
 
 
-def merge_similar(lab: NDArray[np.float32], regions: Labels, max_regions: int, objects: Labels | None = None) -> Labels:
+def merge_similar(image: Tensor, regions: Labels, max_regions: int | None, objects: Labels | None = None) -> Labels:
     """Merge the two neighbours nearest in mean colour until at most ``max_regions`` of the regions 0 to R - 1 are left.
 
     A merged region has the mean of all its pixels and the id of its largest part. Regions of different objects do not
-    merge.
+    merge. None: all stay.
     """
+    if max_regions is None or regions.max() < max_regions:
+        return regions
     graph = RegionGraph(regions, objects)
-    merge_nearest(graph, lab_sums(lab, regions), max_regions)
+    merge_nearest(graph, lab_sums(rgb_to_lab(image), regions), max_regions)
     return graph.roots()[regions]
 
 

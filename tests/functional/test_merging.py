@@ -27,6 +27,8 @@ class TestMergeRegions:
         labels = (torch.arange(96) // 24).expand(64, 96)
         merged = merge_regions(0.3 + 0.02 * noise(64, 96), labels, objects=labels // 2 + 5)
         assert torch.equal(merged, labels // 2 * 2)
+        with pytest.raises(ValueError, match="objects must be a map that labels divide .* through the region 1"):
+            merge_regions(noise(64, 96), labels, objects=(torch.arange(96) // 30).expand(64, 96))
 
     @pytest.mark.parametrize(("rows", "count"), [(64, 2), (40, 1)])
     def test_colors_must_differ_along_most_of_a_contour(self, rows: int, count: int) -> None:

@@ -119,7 +119,7 @@ class TestRegionSplat(BaseTester):
             ({"region_ids": torch.tensor([0])}, ValueError, r"region_ids must have shape \(2,\); got \(1,\)"),
             ({"regions": torch.tensor([[0.0, 1.5]])}, ValueError, "regions must hold whole numbers; got 1.5"),
             ({"regions": torch.zeros(2, 3, 3).long()}, ValueError, "regions must hold 1 map"),
-            ({"regions": "map.png"}, TypeError, "got str: RegionMap.from_labels reads it"),
+            ({"regions": "map.png"}, TypeError, r"got str: RegionMap\(regions\) reads it"),
             ({"regions": None}, ValueError, "regions must be given with region_ids; got None"),
             ({"regions": None, "region_ids": None}, ValueError, "size must be given"),
             ({"regions": None, "size": (0, 4)}, ValueError, "size must be at least 1 x 1"),

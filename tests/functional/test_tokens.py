@@ -63,9 +63,28 @@ def test_opacities_are_multiplied_in() -> None:
     torch.testing.assert_close(faint.tokens()[:, 5:], (0.5 * field.colors).float(), check_dtype=False)
 
 
-def test_too_few_columns() -> None:
-    with pytest.raises(ValueError, match=r"tokens must have 5 \+ C columns; got \(9, 5\)"):
-        GaussianField.from_tokens(torch.zeros(9, 5), size=SIZE)
+def test_half_precision_holds_large_images() -> None:
+    field, size = field_of(dtype=torch.float32), (480, 854)
+    tokens = to_tokens(field.means.half(), field.cholesky.half(), field.colors.half(), size)
+    assert tokens.dtype == torch.float32 and tokens.isfinite().all()
+    for half, full in zip(from_tokens(tokens.half(), size), from_tokens(tokens, size), strict=True):
+        torch.testing.assert_close(half, full, rtol=0.01, atol=0.5)
+
+
+def test_exception() -> None:
+    for function in (lambda *tokens, size: from_tokens(*tokens, size), GaussianField.from_tokens):
+        with pytest.raises(ValueError, match=r"tokens must have 5 \+ C columns; got \(9, 5\)"):
+            function(torch.zeros(9, 5), size=SIZE)
+        with pytest.raises(ValueError, match="size must be at least 1 x 1; got .0, 8"):
+            function(torch.zeros(9, 6), size=(0, 8))
+    means, cholesky, colors = field_of().means, field_of().cholesky, field_of().colors
+    for tables, words in (
+        ((means, -cholesky, colors), "cholesky must have l11 > 0 and l22 > 0"),
+        ((means, cholesky[:4], colors), r"cholesky must have shape \(9, 3\)"),
+        ((means / 0, cholesky, colors), "means must be finite"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            to_tokens(*tables, SIZE)
 
 
 @pytest.mark.parametrize("batch", [None, 2])

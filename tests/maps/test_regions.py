@@ -111,7 +111,7 @@ class TestRegionMap(
 
     def test_noise_keeps_no_table(self, monkeypatch: pytest.MonkeyPatch) -> None:
         regions = RegionMap(blobs(), 0.7)
-        monkeypatch.setattr("kcgs.maps.regions._MOST_PLANES", 1)
+        monkeypatch.setattr("kcgs.maps.table_of_labels._MOST_PLANES", 1)
         noise = RegionMap(blobs(), 0.7)
         assert table_and_size(regions)[0].weights is not None and table_and_size(noise)[0].weights is None
         field = GaussianField.random(20, (45, 70), regions=regions, seed=0)
@@ -130,6 +130,21 @@ class TestRegionMap(
         assert len(moved) == 2 * 9
 
 
+def test_resized_maps_merge_and_stack_as_their_sources() -> None:
+    labels = torch.zeros(40, 40).long()
+    labels[:, 20:], labels[7, 7] = 1, 2  # region 2 has no pixel of the small map
+    regions = RegionMap(labels, {(0, 1): 0.5, (0, 2): 1.0, (1, 2): 1.3})
+    for size in ((10, 10), (80, 80)):
+        resized = regions.resize(size)
+        merged, new_ids = resized.merge([(0, 2)])
+        expected, expected_ids = regions.merge([(0, 2)])
+        assert merged is not None and expected is not None and torch.equal(new_ids, expected_ids)
+        assert torch.equal(merged.membership(0), expected.resize(size).membership(0))
+        assert torch.equal(RegionMap.stack([resized, resized])[1].membership(0), resized.membership(0))
+    with pytest.raises(ValueError, match="maps must be at least one, .* and resized from one size; got"):
+        RegionMap.stack([regions.resize((10, 10)), RegionMap(labels[:10, :10])])
+
+
 def test_membership_of_ids_of_any_kind() -> None:
     """One id counts once, however it is written."""
     regions = RegionMap(torch.tensor([[3, 3, 7, 9]]))
@@ -137,6 +152,14 @@ def test_membership_of_ids_of_any_kind() -> None:
     for ids in (np.int64(3), regions.ids[0], torch.tensor([3, 3]), np.array([3, 3]), {3}, (i for i in (3, 3, 99))):
         assert torch.equal(regions.membership(ids), three)
     assert not regions.membership([]).any()
+    for number in (3.5, [3, 3.5], torch.tensor(3.5)):
+        with pytest.raises(TypeError, match="region_ids must have an integer dtype; got torch.float32"):
+            regions.membership(number)
+
+
+def test_relabel_refuses_an_unknown_word() -> None:
+    with pytest.raises(ValueError, match="new_contours must be 'hard' or 'mean'; got 'soft'"):
+        RegionMap(blobs()).relabel(blobs(), "soft")  # type: ignore[arg-type]
 
 
 class TestPairSoftness:
@@ -401,7 +424,7 @@ class TestEdgeBand(BaseTester, without={"test_gradcheck": "labels are integers",
         # smaller than the band
         assert edge_band(torch.tensor([[0, 1]])).all() and edge_band(torch.tensor([[0], [1], [1]])).all()
 
-    @pytest.mark.parametrize("width", [0, 0.5, -1, math.inf, math.nan])
-    def test_exception(self, width: float) -> None:
-        with pytest.raises(ValueError, match="width must be"):
+    @pytest.mark.parametrize("width", [0, 0.5, -1, math.inf, math.nan, "5"])
+    def test_exception(self, width: Any) -> None:
+        with pytest.raises((TypeError, ValueError), match="width must be"):
             edge_band(blobs(), width)

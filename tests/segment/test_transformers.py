@@ -175,6 +175,14 @@ class TestSegment:
         whole = segment_with_scores(IMAGE, "sam", model=folder(model), grid=1, min_score=1.0)  # that no mask covers
         assert whole.names is None and whole.scores is not None and whole.scores.isnan().all()
 
+    def test_the_object_of_a_prompt_is_not_lost(self, folder: Folder, monkeypatch: pytest.MonkeyPatch) -> None:
+        logits = torch.full((1, 1, 32, 32), -1.0)
+        logits[..., 9:12, 9:12] = 1.0
+        monkeypatch.setattr("kcgs.segment.methods.sam._predict_masks", lambda *_: (logits, torch.ones(1, 1)))
+        with pytest.raises(ValueError, match=r"min_size must be smaller than the object, \d+ pixels in all; got 49"):
+            segment(IMAGE, "sam", model=folder("sam"), box=BOX)
+        assert segment(IMAGE, "sam", model=folder("sam"), box=BOX, min_size=1).any()
+
     def test_names_are_prompts(self, folder: Folder) -> None:
         def names(**options: Any) -> set[str]:
             return set((segment_with_scores(IMAGE, "text", model=folder("clipseg"), **options).names or {}).values())

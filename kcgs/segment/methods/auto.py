@@ -106,23 +106,23 @@ def _divide(image: Tensor, objects: Labels | None, min_size: int, max_regions: i
     if image[0].numel() <= _LARGE:
         regions = _regions(image, objects, min_size)
     else:
-        small = reduce_image(image, _MAX_PIXELS)
-        smallest = max(1, round(min_size * small[0].numel() / image[0].numel()))
+        small, smallest = _reduce(image, min_size)
         parts = None if objects is None else _resize(objects, small.shape[1:])
-        regions = _merge_similar(small, _regions(small, parts, smallest), max_regions, parts)
+        regions = merge_similar(small, _regions(small, parts, smallest), max_regions, parts)
         regions = _enlarge(image, regions)
     if objects is None:
         return regions
-    return _merge_similar(image, clean(regions, min_size, objects), max_regions, objects)
+    return merge_similar(image, clean(regions, min_size, objects), max_regions, objects)
 
 
-def _merge_similar(image: Tensor, regions: Labels, max_regions: int | None, objects: Labels | None) -> Labels:
-    if max_regions is None or regions.max() < max_regions:
-        return regions
-    return merge_similar(rgb_to_lab(image), regions, max_regions, objects)
+def _reduce(image: Tensor, min_size: int) -> tuple[Tensor, int]:
+    """Return an image of at most `_MAX_PIXELS`, and the least size of regions there, in pixels."""
+    small = reduce_image(image, _MAX_PIXELS)
+    return small, max(1, round(min_size * small[0].numel() / image[0].numel()))
 
 
 def _regions(image: Tensor, objects: Labels | None, min_size: int) -> Labels:
+    """Return the regions at the coarsest scale that gives enough of them, less contours that save too little error."""
     best = np.zeros(image.shape[1:], dtype=np.int64) if objects is None else clean(objects, 1)
     if (image != image[:, :1, :1]).any():
         for scale in _SCALES:
@@ -139,22 +139,18 @@ def _felzenszwalb_regions(image: Tensor, scale: float, min_size: int, objects: L
     """Return 4-connected regions of (3, H, W), of at least ``min_size`` pixels, contours on edges."""
     from skimage.segmentation import felzenszwalb
 
-    small = reduce_image(image, _MAX_PIXELS)
-    smallest = max(1, round(min_size * small[0].numel() / image[0].numel()))
+    small, smallest = _reduce(image, min_size)
     # Lab over 100 has about the range of RGB in [0, 1], for which scales are usually given
     raw = felzenszwalb(rgb_to_lab(small) / 100, scale=scale, sigma=_SIGMA, min_size=smallest)
     return clean(_enlarge(image, clean(raw, smallest)), min_size, objects)
-
-
-def _shrink(image: Tensor) -> float:
-    return max(1.0, math.sqrt(image[0].numel() / _MAX_PIXELS))
 
 
 def _enlarge(image: Tensor, regions: Labels) -> Labels:
     """Return regions at the size of (3, H, W), with contours on its edges."""
     if regions.shape != image.shape[1:]:
         regions = to_regions(_resize(regions, image.shape[1:]))
-    return snap_contours(rgb_to_lab(image), regions, math.ceil(2 * _shrink(image)))
+    shrink = max(1.0, math.sqrt(image[0].numel() / _MAX_PIXELS))
+    return snap_contours(rgb_to_lab(image), regions, math.ceil(2 * shrink))
 
 
 def _resize(labels: Labels, size: tuple[int, ...]) -> Labels:

@@ -130,7 +130,7 @@ def lseg(
     if isinstance(embeddings, str | os.PathLike):
         with library_errors(f"cannot read {os.fspath(embeddings)} as an .npy array"):
             embeddings = np.load(embeddings, allow_pickle=False)
-    texts = check_floating("embeddings", torch.from_numpy(embeddings), dims=(2,)).float()
+    texts = check_floating("embeddings", torch.as_tensor(embeddings), dims=(2,)).float()
     _check_names(names, len(texts))
     features = _run(image, model, size, mean, std)
     if len(features) != texts.shape[1]:

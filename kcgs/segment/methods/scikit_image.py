@@ -50,9 +50,7 @@ class _Segmenter:
                 check_number(name, value, 0)
         with library_errors(f"{self.name} of scikit-image fails with {options}"):
             regions = connect(np.asarray(self._function(self.convert(image), **options), dtype=np.int64))
-        if max_regions is not None:
-            regions = merge_similar(rgb_to_lab(image), regions, max_regions)
-        return torch.from_numpy(regions)
+        return torch.from_numpy(merge_similar(image, regions, max_regions))
 
 
 def _to_lightness(image: Tensor) -> NDArray[np.float64]:
