@@ -116,6 +116,6 @@ def _fit(field: GaussianField, regions: RegionMap, target: Tensor, weight: Tenso
     rate, color_rate = field.means.detach().new_tensor([_RATE, _COLOR_RATE])
     optimizer = GaussianAdam(field, rate, color_lr=color_rate)
     renderer = Renderer(field.size, regions, _CUTOFF)
-    state = FieldState(field, optimizer, SquaredError(target, weight), renderer)
+    state = FieldState(field, optimizer, SquaredError(target, weight=weight), renderer)
     run(state, partial(step_field, state), count_iterations(state, _STEPS), [End()], cosine_decay)
     return field

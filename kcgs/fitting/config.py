@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from kcgs._objectives import ObjectiveName, check_objective
+from kcgs._objectives import ObjectiveName, Purpose, check_objective, objective_for
 from kcgs._repr import shorten
 from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.kernels import BACKENDS
@@ -182,6 +182,13 @@ class FitConfig(BaseModel):
         else:
             values = tomllib.loads((files("kcgs.recipes") / f"{recipe}.toml").read_text(encoding="utf-8"))
         return cls(**{**values, **settings})
+
+
+def config_for(purpose: Purpose, config: FitConfig) -> FitConfig:
+    """Return the settings with the objective of a purpose; refuse settings that the purpose does not take."""
+    if config.bounded and purpose != "fit":
+        raise InvalidArgument("bounded", f"False for a {purpose}", True)
+    return config.model_copy(update={"objective": objective_for(purpose, config.objective)})
 
 
 def available_recipes() -> list[str]:

@@ -111,6 +111,10 @@ class TestFitVideo:
         with pytest.raises(ValueError, match=match):
             fit_video(frames, maps, 8, iterations=2)
 
+    def test_bounded(self) -> None:
+        with pytest.raises(ValueError, match="bounded must be False for a video; got True"):
+            fit_video(FRAMES, None, 8, iterations=2, bounded=True)
+
 
 class TestInterpolate:
     @pytest.mark.parametrize("number", [0, 1])
