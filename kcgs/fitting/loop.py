@@ -94,9 +94,9 @@ def fit(
             this batch size, and with region ids if there is a map. None: the recipe's initializer.
         densify: an event of your own that adds Gaussians: an object with ``act(state)``, called before every step, and
             ``end``, the share of the fit at its last addition. None: matching pursuit.
-        optimizer: a name of :class:`FitConfig`, or a function from a field to an optimizer with the methods of
-            :class:`kcgs.optim.GaussianAdam`, and its members ``rate``, ``has_drafts`` and ``keeps_averages``, such as a
-            :class:`kcgs.optim.ReparametrizedOptimizer`. None: the recipe's optimizer.
+        optimizer: a name of :class:`FitConfig`, or a function from a field to an optimizer with the members of
+            :class:`kcgs.optim.FieldOptimizer`, such as a :class:`kcgs.optim.ReparametrizedOptimizer`; for one image
+            without ``freeze`` and ``frozen_rows``. None: the recipe's optimizer.
         seed: of the random start.
         on_step: called after every iteration with its number (from 1) and the last history entry; returning True
             stops the fit.

@@ -16,7 +16,7 @@ from .user_objects import check_optimizer
 def make_optimizer(problem: Problem, field: GaussianField, sigma: float) -> FieldOptimizer:
     """Return the optimizer of a field whose Gaussians begin with `sigma`, in pixels."""
     if problem.objects.optimizer is not None:
-        return check_optimizer(problem.objects.optimizer(field))
+        return check_optimizer(problem.objects.optimizer(field), problem.num_images)
     return _OPTIMIZERS[problem.config.optimizer](problem.config, field, sigma)
 
 

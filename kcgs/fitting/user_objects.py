@@ -14,6 +14,8 @@ from kcgs.optim import Event, FieldOptimizer, Loss
 
 Initializer = Callable[[Tensor, int, RegionMap | None, int], GaussianField]
 _OPTIMIZER_MEMBERS = tuple(name for name in vars(FieldOptimizer) if not name.startswith("_"))
+# a fit of one image freezes no rows
+_BATCH_MEMBERS = ("freeze", "frozen_rows")
 
 
 @runtime_checkable
@@ -90,9 +92,10 @@ def _layout(colors: tuple[int, ...], size: tuple[int, ...], has_ids: bool) -> st
     return f"colors {colors}, size {size} and {'' if has_ids else 'no '}region_ids"
 
 
-def check_optimizer(optimizer: FieldOptimizer) -> FieldOptimizer:
-    """Validate that a user's optimizer has all members of a FieldOptimizer."""
-    if missing := [name for name in _OPTIMIZER_MEMBERS if not hasattr(optimizer, name)]:
-        expected = f"a function that returns an optimizer with {', '.join(_OPTIMIZER_MEMBERS)}"
+def check_optimizer(optimizer: FieldOptimizer, num_images: int) -> FieldOptimizer:
+    """Validate that a user's optimizer has the members of a FieldOptimizer that a fit of so many images calls."""
+    names = [name for name in _OPTIMIZER_MEMBERS if num_images > 1 or name not in _BATCH_MEMBERS]
+    if missing := [name for name in names if not hasattr(optimizer, name)]:
+        expected = f"a function that returns an optimizer with {', '.join(names)}"
         raise InvalidArgument("optimizer", expected, f"{type(optimizer).__name__} without {', '.join(missing)}")
     return optimizer

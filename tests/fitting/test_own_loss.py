@@ -208,9 +208,29 @@ def test_an_optimizer_that_keeps_no_averages_is_not_gone_on_with() -> None:
 
 
 def test_an_optimizer_without_a_rate() -> None:
-    words = "an optimizer with param_groups, .*; got Adam without has_drafts, keeps_averages, rate, append, keep, "
-    with pytest.raises(ValueError, match=f"^optimizer must be a function that returns {words}freeze, frozen_rows$"):
-        fit(image(), None, 9, optimizer=lambda field: torch.optim.Adam(field.parameters()))
+    words = "an optimizer with param_groups, .*; got Adam without has_drafts, keeps_averages, rate, append, keep"
+    for images, more in ((image(), ""), (torch.stack([image()] * 2), ", freeze, frozen_rows")):
+        with pytest.raises(ValueError, match=f"^optimizer must be a function that returns {words}{more}$"):
+            fit(images, None, 9, optimizer=lambda field: torch.optim.Adam(field.parameters()))
+
+
+def test_an_optimizer_for_one_image_freezes_no_rows() -> None:
+    class Adam:
+        def __init__(self, field: GaussianField) -> None:
+            self._adam = GaussianAdam(field)
+
+        def __getattr__(self, name: str) -> Any:
+            if name in ("freeze", "frozen_rows"):
+                raise AttributeError(name)
+            return getattr(self._adam, name)
+
+    own, named = (fit(image(), LABELS, 30, iterations=40, optimizer=value) for value in (Adam, None))
+    assert torch.equal(own.scene.render(), named.scene.render())
+
+
+def test_an_optimizer_of_ones_own_is_not_bounded_by_a_setting() -> None:
+    with pytest.raises(ValueError, match="bounded must be False with an optimizer of your own; got True"):
+        fit(image(), None, 9, bounded=True, optimizer=GaussianAdam)
 
 
 def test_an_event_that_adds_too_many_and_one_that_ends_the_fit() -> None:
