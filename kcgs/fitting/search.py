@@ -78,8 +78,10 @@ def _fit(problem: Problem, count: int, trials: list[_Trial], seconds: float, run
     settings = config.model_copy(update=changes)
     nearest = min(trials, key=lambda t: abs(math.log(t.num_gaussians / count)), default=None)
     problem = replace(problem, num_gaussians=count, config=settings)
-    goes_on = nearest is not None and _can_go_on(problem, nearest)
-    state = _warm_start(problem, nearest.state) if nearest is not None and goes_on else start(problem)
+    if nearest is not None and _can_go_on(problem, nearest):
+        state = _warm_start(problem, nearest.state)
+    else:
+        state = start(problem)
     result = run(state)
     rendered = result.scene.render().to(problem.target).view_as(problem.target)
     return _Trial(count, float(psnr(rendered, problem.target)), result, state)
