@@ -16,6 +16,7 @@ from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.kernels import BACKENDS
 from kcgs.maps import MAX_SOFTNESS
 
+# iterations of a fit where neither `iterations` nor `max_seconds` is set
 _USUAL_ITERATIONS = 700
 # settings of version 0.3, and what replaces each
 _RENAMED = {

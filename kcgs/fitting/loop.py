@@ -137,9 +137,10 @@ def fit(
     problem = make_problem(image, regions, num_gaussians, config, seed, objects, size=size, channels=channels)
     if resume and checkpoint is None:
         raise InvalidArgument("checkpoint", "a file to go on from, with resume", None)
-    own = [name for name, value in objects._asdict().items() if value is not None]
-    if own and checkpoint is not None:
-        raise InvalidArgument("checkpoint", f"None with {own[0]} of your own, which no file keeps", repr(checkpoint))
+    functions = [name for name, value in objects._asdict().items() if value is not None]
+    if functions and checkpoint is not None:
+        expected = f"None with {functions[0]} of your own, which no file keeps"
+        raise InvalidArgument("checkpoint", expected, repr(checkpoint))
     if problem.num_images > 1 and checkpoint is not None:
         raise InvalidArgument(
             "checkpoint", f"None with {problem.num_images} images: fit them one by one", repr(checkpoint)

@@ -23,10 +23,10 @@ from .user_objects import NO_OBJECTS, UserObjects
 
 # value of the target where there is no image
 _GREY = 0.5
-# measured peak memory of a fit: bytes per pixel, per value of an image, and per Gaussian
-_PIXEL_BYTES = 50
-_CHANNEL_BYTES = 50
-_GAUSSIAN_BYTES = 1000
+# peak memory of a fit in bytes, measured: for each pixel, for each value of an image, and for each Gaussian
+_BYTES_PER_PIXEL = 50
+_BYTES_PER_VALUE = 50
+_BYTES_PER_GAUSSIAN = 1000
 # `clamp="auto"` clips the render where an image is 0 or 1, if at least this share of its values are
 _SATURATED_SHARE = 0.25
 
@@ -181,5 +181,5 @@ def _check_batch(problem: Problem) -> None:
     ):
         if value is not None:
             raise InvalidArgument(name, f"{expected} with {count} images: fit them one by one", repr(value))
-    pixels = height * width * (_PIXEL_BYTES + channels * _CHANNEL_BYTES)
-    check_batch_memory("image", problem.target, pixels + problem.num_gaussians * _GAUSSIAN_BYTES)
+    bytes_of_image = height * width * (_BYTES_PER_PIXEL + channels * _BYTES_PER_VALUE)
+    check_batch_memory("image", problem.target, bytes_of_image + problem.num_gaussians * _BYTES_PER_GAUSSIAN)

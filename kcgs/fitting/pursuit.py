@@ -30,6 +30,7 @@ _REACH = 3.0
 _RADIUS = 1.5
 # largest relative change of a gain that breaks ties
 _SCATTER = 1e-4
+# weights below it are skipped in the render of candidates
 _CUTOFF = 1e-4
 
 

@@ -28,9 +28,10 @@ from .state import FitState
 _FIRST_SPACING = 256
 # expected gain in PSNR for twice as many Gaussians, in dB, on photos
 _DECIBELS_PER_OCTAVE = 3.0
-# the search ends when the numbers of Gaussians that are enough and too few have at most this ratio
+# The search ends when the least number of Gaussians that is enough is at most this multiple of the largest number that
+# is too small.
 _PRECISION = 1.04
-# or when the curve expects to save less than this ratio
+# The search also ends when the secant predicts that less than this factor of Gaussians can be saved.
 _EXPECTED_PRECISION = 1.025
 # share of the schedule at which a continued fit starts
 _WARM_START = 0.6
