@@ -106,9 +106,7 @@ class FitConfig(BaseModel):
     )
     # The length
     iterations: int | None = Field(
-        None,
-        ge=1,
-        description="None: 700, or with `max_seconds` as many as the time allows",
+        None, ge=1, description="None: 700, or with `max_seconds` as many as the time allows"
     )
     max_seconds: float | None = Field(
         None,

@@ -22,13 +22,8 @@ def make_optimizer(problem: Problem, field: GaussianField, sigma: float) -> Fiel
 
 def _gaussian_adam(config: FitConfig, field: GaussianField, sigma: float) -> GaussianAdam:
     factor = config.learning_rate_factor
-    return GaussianAdam(
-        field,
-        LEARNING_RATE * factor,
-        color_lr=COLOR_LEARNING_RATE * factor,
-        min_sigma=config.min_sigma,
-        bounded=config.bounded,
-    )
+    rate, color_rate = LEARNING_RATE * factor, COLOR_LEARNING_RATE * factor
+    return GaussianAdam(field, rate, color_lr=color_rate, min_sigma=config.min_sigma, bounded=config.bounded)
 
 
 def _adan(config: FitConfig, field: GaussianField, sigma: float) -> GaussianImageAdan:

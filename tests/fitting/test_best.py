@@ -49,10 +49,6 @@ class TestBest:
         assert counts[-1] == 60
         assert all(b >= a for a, b in pairwise(counts))
 
-    def test_growth_off_starts_whole(self) -> None:
-        image, labels = scene()
-        assert fit(image, labels, 40, recipe=quick(densify_from=1.0)).history[0].num_gaussians == 40
-
     def test_same_seed_same_bits(self, fitted: FitResult) -> None:
         image, labels = scene()
         a, b = fitted, fit(image, labels, 40, recipe=quick(), seed=0)
