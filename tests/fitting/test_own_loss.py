@@ -161,12 +161,19 @@ def test_first_gaussians_of_ones_own(num_images: int, regions: Tensor | None) ->
     ("field", "words"),
     [
         (None, "NoneType"),
-        (GaussianField.random(3, (32, 40), seed=0), r"colors \(3, 3\), size \(32, 40\) and no region_ids"),
-        (initial_field(image()[None], 3, LABELS), r"colors \(1, 3, 3\), size \(32, 40\) and region_ids"),
+        (
+            GaussianField.random(3, (32, 40), seed=0),
+            r"colors \(3, 3\), size \(32, 40\), no region_ids and no opacities",
+        ),
+        (initial_field(image()[None], 3, LABELS), r"colors \(1, 3, 3\), size \(32, 40\), region_ids and no opacities"),
+        (
+            GaussianField(*(torch.ones(1, 1, n) for n in (2, 3, 3)), opacities=torch.ones(1, 1), size=(32, 40)),
+            r"colors \(1, 1, 3\), size \(32, 40\), no region_ids and opacities",
+        ),
     ],
 )
 def test_first_gaussians_that_do_not_fit(field: object, words: str) -> None:
-    expected = r"a GaussianField of colors \(1, 1, 3\), size \(32, 40\) and no region_ids"
+    expected = r"a GaussianField of colors \(1, 1, 3\), size \(32, 40\), no region_ids and no opacities"
     with pytest.raises(ValueError, match=f"^initializer must be a function that returns {expected}; got {words}$"):
         fit(image(), None, 60, initializer=lambda *arguments: field)
 
