@@ -116,8 +116,7 @@ class SceneDataset(Dataset[Scene]):
         """Return a scene, without rows of the colour 0."""
         position = range(len(self))[operator.index(index)]
         number = int(torch.searchsorted(self._firsts, position, right=True)) - 1
-        shard, row = self._shard(number), position - int(self._firsts[number])
-        return shard.scene(row)
+        return self._shard(number).scene(position - int(self._firsts[number]))
 
     def __getitems__(self, indices: Sequence[int]) -> SceneBatch:
         """Return scenes as tensors, in the order of the indices; a DataLoader calls this."""

@@ -38,10 +38,6 @@ class TestBest:
         assert with_.psnr > without.psnr + 0.5
         assert with_.ef_psnr > without.ef_psnr + 0.5
 
-    def test_psnr_is_that_of_the_scene_as_drawn_by_default(self, fitted: FitResult) -> None:
-        drawn = fitted.scene.render()
-        assert fitted.history[-1].psnr == pytest.approx(float(psnr(drawn, scene()[0])), abs=0.01)
-
     def test_grows_to_n(self) -> None:
         image, labels = scene()
         counts = [h.num_gaussians for h in fit(image, labels, 60, recipe=quick(prune=0.0)).history]
