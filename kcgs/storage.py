@@ -104,7 +104,10 @@ class MappedScene:
         means, cholesky, colors = (self.tensors[name][index][rows] for name in _REQUIRED)
         ids = self.tensors["region_ids"][index][rows].long() if "region_ids" in self.tensors else None
         field = GaussianField(means, cholesky, colors, ids, size=self.size)
-        return Scene(field, None if self._regions is None else self._regions[index])
+        regions = self._regions
+        if regions is not None and regions.num_maps is not None:
+            regions = regions[index if regions.num_maps > 1 else 0]
+        return Scene(field, regions)
 
 
 def map_file(path: str | os.PathLike[str]) -> MappedScene:

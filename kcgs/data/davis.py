@@ -73,6 +73,6 @@ class Davis:
 
     def __getitem__(self, key: int | str) -> DavisFrame:
         """Read the first frame of a sequence, by the position or the name of the sequence."""
-        name = self.sequences[key] if isinstance(key, int) else key
+        name = key if isinstance(key, str) else self.sequences[key]
         image, labels = self._images / name / "00000.jpg", self._annotations / name / "00000.png"
         return DavisFrame(name, load_image(image), load_labels(labels))

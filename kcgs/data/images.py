@@ -22,11 +22,7 @@ _OPTIONS: dict[str, dict[str, object]] = {
 }
 
 
-def load_image(
-    path: str | os.PathLike[str],
-    *,
-    channels: Literal["RGB", "L", "RGBA"] = "RGB",
-) -> Tensor:
+def load_image(path: str | os.PathLike[str], *, channels: Literal["RGB", "L", "RGBA"] = "RGB") -> Tensor:
     """Read an image as a tensor.
 
     It reads PNG, JPEG, WebP, TIFF, GIF, BMP and other formats of Pillow, and the first of several frames. EXIF

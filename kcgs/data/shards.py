@@ -18,7 +18,7 @@ from kcgs._repr import brief
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap, to_tokens
 from kcgs.nn import GaussianField, pad_rows
-from kcgs.scene import Scene
+from kcgs.scene import Scene, check_batch
 from kcgs.storage import MappedScene, map_file
 
 # digits in the names of shards
@@ -116,26 +116,24 @@ class SceneDataset(Dataset[Scene]):
         """Return a scene, without rows of the colour 0."""
         position = range(len(self))[operator.index(index)]
         number = int(torch.searchsorted(self._firsts, position, right=True)) - 1
-        shard, row = self._shard(number), position - int(self._firsts[number])
-        return shard.scene(row)
+        return self._shard(number).scene(position - int(self._firsts[number]))
 
     def __getitems__(self, indices: Sequence[int]) -> SceneBatch:
         """Return scenes as tensors, in the order of the indices; a DataLoader calls this."""
         positions = torch.tensor([range(len(self))[operator.index(index)] for index in indices])
         numbers = torch.searchsorted(self._firsts, positions, right=True) - 1
         rows = positions - self._firsts[numbers]
-        tables: dict[str, Tensor] = {}
-        for number in numbers.unique().tolist():
-            chosen = numbers == number
-            for name, tensor in self._shard(number).tensors.items():
-                if name in SceneBatch._fields:
-                    part = tensor.index_select(0, rows[chosen])
-                    tables.setdefault(name, part.new_empty(len(positions), *part.shape[1:]))[chosen] = part
-        ids = tables.get("region_ids")
+        place = numbers.argsort(stable=True).argsort()  # of each scene, where the scenes are sorted by their shards
+
+        def table(name: str) -> Tensor:
+            chosen = [(self._shard(number), rows[numbers == number]) for number in numbers.unique().tolist()]
+            parts = [shard.tensors[name].index_select(0, indices) for shard, indices in chosen]
+            # each shard has the smallest integer type that holds its ids
+            return torch.cat([part.long() if name == "region_ids" else part for part in parts])[place]
+
         sizes = torch.tensor([self._shard(number).size for number in numbers.tolist()]).view(-1, 2)
-        return SceneBatch(
-            positions, sizes, tables["means"], tables["cholesky"], tables["colors"], None if ids is None else ids.long()
-        )
+        ids = table("region_ids") if "region_ids" in self._shard(0).tensors else None
+        return SceneBatch(positions, sizes, table("means"), table("cholesky"), table("colors"), ids)
 
     @staticmethod
     def collate(batch: SceneBatch) -> SceneBatch:
@@ -178,13 +176,15 @@ def save_shard(
 
     Args:
         path: 00000.safetensors, 00001.safetensors and so on.
-        scenes: of images of one size; opacities are merged into the colours.
+        scenes: a batch of images of one size; opacities are merged into the colours.
         names: of the images.
         psnr: of the scenes, in dB, such as `psnr` of :class:`kcgs.FitResult`.
-        metadata: more notes for the file.
+        metadata: notes for the file, besides those of the scenes.
 
     Raises:
-        ValueError: `path` has no name of a shard; the number of names or PSNRs is not that of the scenes.
+        TypeError: no batch of scenes.
+        ValueError: `path` has no name of a shard; the number of names or PSNRs is not that of the scenes; a PSNR is
+            NaN or minus infinity.
 
     Example:
         >>> import tempfile
@@ -197,11 +197,13 @@ def save_shard(
         raise InvalidArgument("path", "a name such as 00000.safetensors", repr(str(path)))
     numbers: list[float] = torch.as_tensor(psnr, dtype=torch.float64).tolist()
     for name, values in (("names", names), ("psnr", numbers)):
-        if len(values) != len(scenes):
+        if len(values) != len(check_batch(scenes)):
             raise InvalidArgument(name, f"one for each of {len(scenes)} scenes", len(values))
+    if not all(number > -math.inf for number in numbers):
+        raise InvalidArgument("psnr", "numbers of dB", numbers)
     # JSON has no infinity, the PSNR of an image without error
-    finite = [number if math.isfinite(number) else None for number in numbers]
-    notes = {**(metadata or {}), "names": json.dumps([*names]), "psnr": json.dumps(finite)}
+    finite = [None if number == math.inf else number for number in numbers]
+    notes = {**scenes.metadata, **(metadata or {}), "names": json.dumps([*names]), "psnr": json.dumps(finite)}
     field = scenes.field
     field = GaussianField(field.means, field.cholesky, field.merged_colors(), field.region_ids, size=field.size)
     return Scene(field, scenes.regions, notes).save(path)

@@ -42,10 +42,13 @@ _DENSITY = 2.0
 _LEAST_ADDED = 16
 # standard deviation of added Gaussians, in their spacing
 _SIGMA = 0.6
-_STEPS = 120
+# iterations of the fit
+_ITERATIONS = 120
+# weights below it are skipped in renders
 _CUTOFF = 1e-4
-# learning rates; with larger rates similar Gaussians oscillate, and the hole shows ripples
+# learning rate of positions and shapes; with a larger rate similar Gaussians oscillate, and the hole shows ripples
 _RATE = 0.07
+# learning rate of colours; a larger rate has the same effect
 _COLOR_RATE = 0.015
 
 
@@ -116,6 +119,6 @@ def _fit(field: GaussianField, regions: RegionMap, target: Tensor, weight: Tenso
     rate, color_rate = field.means.detach().new_tensor([_RATE, _COLOR_RATE])
     optimizer = GaussianAdam(field, rate, color_lr=color_rate)
     renderer = Renderer(field.size, regions, _CUTOFF)
-    state = FieldState(field, optimizer, SquaredError(target, weight), renderer)
-    run(state, partial(step_field, state), count_iterations(state, _STEPS), [End()], cosine_decay)
+    state = FieldState(field, optimizer, SquaredError(target, weight=weight), renderer)
+    run(state, partial(step_field, state), count_iterations(state, _ITERATIONS), [End()], cosine_decay)
     return field

@@ -76,14 +76,14 @@ class _Seams:
     def expand(self, labels: Tensor, layer: int) -> Tensor:
         """Return the mask of the pixels that should change to `layer`: no other such mask has less total cost."""
         first, second = self.pairs
-        kept = self._difference(labels[first], labels[second])
+        present = self._difference(labels[first], labels[second])
         second_changes = self._difference(labels[first], torch.full_like(first, layer))
         first_changes = self._difference(torch.full_like(first, layer), labels[second])
         gain = self.costs[layer] - self.costs.gather(0, labels[None])[0]
         # x and y are 1 if the first and the second pixel of a pair change; the pair then costs
-        # kept + (first - kept) x - first y + (first + second - kept) (1 - x) y
-        gain = gain.index_add(0, first, first_changes - kept).index_add(0, second, -first_changes)
-        return _cut(gain, self.pairs, (first_changes + second_changes - kept).clamp_min(0))
+        # present + (first - present) x - first y + (first + second - present) (1 - x) y
+        gain = gain.index_add(0, first, first_changes - present).index_add(0, second, -first_changes)
+        return _minimum_cut(gain, self.pairs, (first_changes + second_changes - present).clamp_min(0))
 
     def _difference(self, one: Tensor, other: Tensor) -> Tensor:
         """Return the difference of two layers at both pixels of all pairs."""
@@ -92,7 +92,7 @@ class _Seams:
         ]).sum(0)  # fmt: skip
 
 
-def _cut(gain: Tensor, pairs: Tensor, cost: Tensor) -> Tensor:
+def _minimum_cut(gain: Tensor, pairs: Tensor, cost: Tensor) -> Tensor:
     """Return x, 0 or 1 for each pixel, with the least sum of gain x over pixels and of cost (1 - x) y over pairs."""
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow

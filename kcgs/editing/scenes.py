@@ -15,7 +15,13 @@ from kcgs.scene import Scene, check_scene
 
 from .fill import MARGIN, fill_hole
 from .masks import check_offset, dilate, shift_labels
-from .selection import members_of, select_regions, select_removable_regions, warn_of_lost_regions
+from .selection import (
+    members_of,
+    select_regions,
+    select_regions_to_relabel,
+    select_removable_regions,
+    warn_of_lost_regions,
+)
 
 # distance from a soft contour, in its standard deviations, beyond which memberships count as 0 or 1
 _CONTOUR_SIGMAS = 4.0
@@ -142,7 +148,7 @@ def replace_background(scene: Scene, region_ids: int | Iterable[int], background
         A new scene, without a graph.
 
     Raises:
-        TypeError, ValueError: as :func:`extract_region`; another number of channels.
+        TypeError, ValueError: as :func:`extract_region`; a resized map; another number of channels.
 
     Example:
         >>> labels = torch.tensor([[0, 0, 3, 3, 3, 5]])
@@ -151,7 +157,7 @@ def replace_background(scene: Scene, region_ids: int | Iterable[int], background
         >>> replace_background(scene, [0, 5], other).regions.labels
         tensor([[6, 6, 3, 3, 3, 6]])
     """
-    regions, _, pixels, members = select_regions(scene, region_ids)
+    regions, _, pixels, members = select_regions_to_relabel(scene, region_ids)
     other, field = check_scene(background, "background").field, scene.field
     channels = field.colors.shape[-1]
     if other.colors.shape[-1] != channels:

@@ -40,14 +40,20 @@ def select_regions(scene: Scene, region_ids: object) -> Selection:
     return Selection(regions, ids, torch.isin(regions.labels, ids), members_of(scene.field, ids))
 
 
+def select_regions_to_relabel(scene: Scene, region_ids: object) -> Selection:
+    """Select regions of a map whose labels are those of its contours: a resized map has finer contours."""
+    selection = select_regions(scene, region_ids)
+    if selection.regions.is_resampled:
+        raise ValueError("scene must not have a resized map: edit the map at its own size, then resize it")
+    return selection
+
+
 def select_removable_regions(scene: Scene, region_ids: object) -> Selection:
     """Select regions whose pixels other regions of the map can take over."""
     if (count := check_type(scene).num_images) is not None:
         advice = "scene[t] is one of them, and kcgs.video edits regions in all of them"
         raise InvalidArgument("scene", "of one image", f"a batch of {count}: {advice}")
-    selection = select_regions(scene, region_ids)
-    if selection.regions.is_resampled:
-        raise ValueError("scene must not have a resized map: edit the map at its own size, then resize it")
+    selection = select_regions_to_relabel(scene, region_ids)
     if selection.regions.num_regions == len(selection.ids):
         received = f"all {len(selection.ids)} regions"
         raise InvalidArgument("region_ids", "a region that takes over pixels", received, verb="leave")

@@ -1,7 +1,7 @@
 """Fit a scene of Gaussians to an image."""
 
 from .checks import check_image_and_regions, check_num_gaussians, default_num_gaussians
-from .config import FitConfig, available_recipes
+from .config import FitConfig, available_recipes, config_for
 from .contour_moves import move_contours
 from .initial import initial_field
 from .loop import describe_excess, fit, fit_problem, precompile

@@ -13,8 +13,9 @@ from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap
 from kcgs.maps import as_region_map
 
-# of the default number of Gaussians
+# pixels per Gaussian, where the user gives no number
 _PIXELS_PER_GAUSSIAN = 100
+# least number of Gaussians, where the user gives none
 _LEAST_GAUSSIANS = 100
 
 

@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from kcgs._objectives import ObjectiveName, check_objective
+from kcgs._objectives import ObjectiveName, Purpose, check_objective, objective_for
 from kcgs._repr import shorten
 from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.kernels import BACKENDS
 from kcgs.maps import MAX_SOFTNESS
 
+# iterations of a fit where neither `iterations` nor `max_seconds` is set
 _USUAL_ITERATIONS = 700
 # settings of version 0.3, and what replaces each
 _RENAMED = {
@@ -105,9 +106,7 @@ class FitConfig(BaseModel):
     )
     # The length
     iterations: int | None = Field(
-        None,
-        ge=1,
-        description="None: 700, or with `max_seconds` as many as the time allows",
+        None, ge=1, description="None: 700, or with `max_seconds` as many as the time allows"
     )
     max_seconds: float | None = Field(
         None,
@@ -182,6 +181,13 @@ class FitConfig(BaseModel):
         else:
             values = tomllib.loads((files("kcgs.recipes") / f"{recipe}.toml").read_text(encoding="utf-8"))
         return cls(**{**values, **settings})
+
+
+def config_for(purpose: Purpose, config: FitConfig) -> FitConfig:
+    """Return the settings with the objective of a purpose; refuse settings that the purpose does not take."""
+    if config.bounded and purpose != "fit":
+        raise InvalidArgument("bounded", f"False for a {purpose}", True)
+    return config.model_copy(update={"objective": objective_for(purpose, config.objective)})
 
 
 def available_recipes() -> list[str]:

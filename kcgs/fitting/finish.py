@@ -12,12 +12,12 @@ from kcgs.scene import Scene
 
 from .batch_maps import map_of_each
 from .clock import Clock
-from .measurement import measure_errors, snapshot
+from .measurement import Measurement, measure_errors, record, snapshot
 from .problem import Problem
 from .region_report import RegionReport, report_regions
 from .removal import remove_gaussians
 from .result import FitResult
-from .state import FitState, Measurement, record
+from .state import FitState
 
 
 def finish(state: FitState, reason: str, clock: Clock) -> FitResult:

@@ -91,12 +91,12 @@ def fit(
         initializer: the first Gaussians, by a name of :class:`FitConfig`; or a function of the images,
             :math:`(B, C, H, W)` (grey images where `image` is None), the number of Gaussians to begin with, a RegionMap
             or None, and the seed, as :func:`kcgs.fitting.initial_field` takes them. It returns a GaussianField with
-            this batch size, and with region ids if there is a map. None: the recipe's initializer.
+            this batch size, without opacities, and with region ids if there is a map. None: the recipe's initializer.
         densify: an event of your own that adds Gaussians: an object with ``act(state)``, called before every step, and
             ``end``, the share of the fit at its last addition. None: matching pursuit.
-        optimizer: a name of :class:`FitConfig`, or a function from a field to an optimizer with the methods of
-            :class:`kcgs.optim.GaussianAdam`, and its members ``rate``, ``has_drafts`` and ``keeps_averages``, such as a
-            :class:`kcgs.optim.ReparametrizedOptimizer`. None: the recipe's optimizer.
+        optimizer: a name of :class:`FitConfig`, or a function from a field to an optimizer with the members of
+            :class:`kcgs.optim.FieldOptimizer`, such as a :class:`kcgs.optim.ReparametrizedOptimizer`; for one image
+            without ``freeze`` and ``frozen_rows``. None: the recipe's optimizer.
         seed: of the random start.
         on_step: called after every iteration with its number (from 1) and the last history entry; returning True
             stops the fit.
@@ -137,9 +137,10 @@ def fit(
     problem = make_problem(image, regions, num_gaussians, config, seed, objects, size=size, channels=channels)
     if resume and checkpoint is None:
         raise InvalidArgument("checkpoint", "a file to go on from, with resume", None)
-    own = [name for name, value in objects._asdict().items() if value is not None]
-    if own and checkpoint is not None:
-        raise InvalidArgument("checkpoint", f"None with {own[0]} of your own, which no file keeps", repr(checkpoint))
+    functions = [name for name, value in objects._asdict().items() if value is not None]
+    if functions and checkpoint is not None:
+        expected = f"None with {functions[0]} of your own, which no file keeps"
+        raise InvalidArgument("checkpoint", expected, repr(checkpoint))
     if problem.num_images > 1 and checkpoint is not None:
         raise InvalidArgument(
             "checkpoint", f"None with {problem.num_images} images: fit them one by one", repr(checkpoint)

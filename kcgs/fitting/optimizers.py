@@ -16,19 +16,14 @@ from .user_objects import check_optimizer
 def make_optimizer(problem: Problem, field: GaussianField, sigma: float) -> FieldOptimizer:
     """Return the optimizer of a field whose Gaussians begin with `sigma`, in pixels."""
     if problem.objects.optimizer is not None:
-        return check_optimizer(problem.objects.optimizer(field))
+        return check_optimizer(problem.objects.optimizer(field), problem.num_images)
     return _OPTIMIZERS[problem.config.optimizer](problem.config, field, sigma)
 
 
 def _gaussian_adam(config: FitConfig, field: GaussianField, sigma: float) -> GaussianAdam:
     factor = config.learning_rate_factor
-    return GaussianAdam(
-        field,
-        LEARNING_RATE * factor,
-        color_lr=COLOR_LEARNING_RATE * factor,
-        min_sigma=config.min_sigma,
-        bounded=config.bounded,
-    )
+    rate, color_rate = LEARNING_RATE * factor, COLOR_LEARNING_RATE * factor
+    return GaussianAdam(field, rate, color_lr=color_rate, min_sigma=config.min_sigma, bounded=config.bounded)
 
 
 def _adan(config: FitConfig, field: GaussianField, sigma: float) -> GaussianImageAdan:

@@ -11,22 +11,22 @@ from torch import Tensor
 
 from kcgs._check import check_count, check_size
 from kcgs._memory import check_batch_memory
-from kcgs._objectives import Purpose, objective_for
+from kcgs._objectives import Purpose
 from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap, edge_band
-from kcgs.optim import OBJECTIVES, ImageObjective, LossObjective, MsSsim, Objective
+from kcgs.optim import OBJECTIVES, ImageObjective, LossObjective, Objective
 
 from .batch_maps import regions_per_map
 from .checks import check_images_and_regions, check_num_gaussians, is_batch, regions_of
-from .config import FitConfig
+from .config import FitConfig, config_for
 from .user_objects import NO_OBJECTS, UserObjects
 
 # value of the target where there is no image
 _GREY = 0.5
-# measured peak memory of a fit: bytes per pixel, per value of an image, and per Gaussian
-_PIXEL_BYTES = 50
-_CHANNEL_BYTES = 50
-_GAUSSIAN_BYTES = 1000
+# peak memory of a fit in bytes, measured: for each pixel, for each value of an image, and for each Gaussian
+_BYTES_PER_PIXEL = 50
+_BYTES_PER_VALUE = 50
+_BYTES_PER_GAUSSIAN = 1000
 # `clamp="auto"` clips the render where an image is 0 or 1, if at least this share of its values are
 _SATURATED_SHARE = 0.25
 
@@ -123,8 +123,7 @@ class Problem:
     def make_objective(self, image: Tensor) -> ImageObjective:
         """Return the objective of the settings for an image, (..., C, H, W)."""
         assert self.config.objective is not None
-        kind = OBJECTIVES[self.config.objective]
-        return MsSsim(image, self.reduction) if kind is MsSsim else kind(image)
+        return OBJECTIVES[self.config.objective](image, self.reduction)
 
 
 def make_problem(
@@ -141,24 +140,20 @@ def make_problem(
 ) -> Problem:
     """Check the arguments of a fit for a purpose."""
     if objects.objective is None:
-        config = config.model_copy(update={"objective": objective_for(purpose, config.objective)})
-    if config.bounded and purpose != "fit":
-        raise InvalidArgument("bounded", f"False for a {purpose}", True)
+        config = config_for(purpose, config)
+    if config.bounded and objects.optimizer is not None:
+        raise InvalidArgument("bounded", "False with an optimizer of your own", True)
     has_image = image is not None
-    if image is None and objects.objective is not None:
+    if not has_image and objects.objective is not None:
         if size is None:
             raise InvalidArgument("size", "(height, width) without an image", None)
-        if config.target_psnr is not None:
-            raise InvalidArgument("target_psnr", "None without an image", config.target_psnr)
-        # moving contours, merging regions and choosing softness need an image
-        update = {"move_contours": False, "merge_regions": False}
-        config = config.model_copy(update=update | ({"softness": 0.0} if config.softness == "auto" else {}))
+        config = _without_image(config)
         target = torch.full((1, check_count("channels", channels), *check_size("size", size)), _GREY)
         region_map = regions_of(target.shape[2:], regions)
         target = target if region_map is None else target.to(region_map.ids.device)
-    elif image is None and size is not None:
-        raise InvalidArgument("image", "given, unless objective is a loss of your own", None)
     elif size is not None:
+        if not has_image:
+            raise InvalidArgument("image", "given, unless objective is a loss of your own", None)
         raise InvalidArgument("size", "None with an image", size)
     else:
         target, region_map = check_images_and_regions(image, regions, keep_batch=purpose == "fit")
@@ -167,6 +162,14 @@ def make_problem(
     if problem.num_images > 1:
         _check_batch(problem)
     return problem
+
+
+def _without_image(config: FitConfig) -> FitConfig:
+    """Return the settings of a fit without an image: contours stay, regions are not merged, softness is not chosen."""
+    if config.target_psnr is not None:
+        raise InvalidArgument("target_psnr", "None without an image", config.target_psnr)
+    softness = 0.0 if config.softness == "auto" else config.softness
+    return config.model_copy(update={"move_contours": False, "merge_regions": False, "softness": softness})
 
 
 def _check_batch(problem: Problem) -> None:
@@ -178,5 +181,5 @@ def _check_batch(problem: Problem) -> None:
     ):
         if value is not None:
             raise InvalidArgument(name, f"{expected} with {count} images: fit them one by one", repr(value))
-    pixels = height * width * (_PIXEL_BYTES + channels * _CHANNEL_BYTES)
-    check_batch_memory("image", problem.target, pixels + problem.num_gaussians * _GAUSSIAN_BYTES)
+    bytes_of_image = height * width * (_BYTES_PER_PIXEL + channels * _BYTES_PER_VALUE)
+    check_batch_memory("image", problem.target, bytes_of_image + problem.num_gaussians * _BYTES_PER_GAUSSIAN)

@@ -30,6 +30,7 @@ _REACH = 3.0
 _RADIUS = 1.5
 # largest relative change of a gain that breaks ties
 _SCATTER = 1e-4
+# weights below it are skipped in the render of candidates
 _CUTOFF = 1e-4
 
 
@@ -303,8 +304,7 @@ def _evaluate(planes: Tensor, labels: Tensor | None, sigma: float) -> tuple[Tens
     label only. So a Gaussian covers a pixel of its region only if the pixel of that column in the
     Gaussian's row is in the region too.
     """
-    # the square of a Gaussian is a Gaussian with sigma / sqrt(2)
-    arguments = planes, labels, sigma, sigma / math.sqrt(2.0), math.ceil(_REACH * sigma)
+    arguments = planes, labels, sigma, math.ceil(_REACH * sigma)
     if not takes_triton(planes):
         from .pursuit_loops import evaluate  # loads numba
 

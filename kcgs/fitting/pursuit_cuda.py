@@ -12,15 +12,14 @@ from kcgs.kernels.cuda.triton_function import triton_function
 _PIXELS = 512
 
 
-def blur(planes: Tensor, labels: Tensor | None, sigma: float, norm_sigma: float, reach: int) -> Tensor:
+def blur(planes: Tensor, labels: Tensor | None, sigma: float, reach: int) -> Tensor:
     """Filter planes of images along columns, then along rows, each time over pixels of the same label only.
 
     Args:
         planes: (B, K, H, W), contiguous float32, on a CUDA device.
         labels: (B, H, W), or (1, H, W) for all images, contiguous; None: all pixels have the same label.
-        sigma: standard deviation of the filter, in pixels.
-        norm_sigma: standard deviation of the last plane's filter, in pixels.
-        reach: of both filters, in pixels.
+        sigma: standard deviation of the filter, in pixels; the last plane's filter is its square.
+        reach: of the filters, in pixels.
     """
     batch, count, height, width = planes.shape
     area = height * width
@@ -32,8 +31,7 @@ def blur(planes: Tensor, labels: Tensor | None, sigma: float, norm_sigma: float,
                 (-(-area // _PIXELS), count, batch),
                 planes, planes if labels is None else labels, blurred, area, stride, length,
                 0 if labels is None or len(labels) == 1 else area,
-                -0.5 / sigma**2, -0.5 / norm_sigma**2, reach, MAPPED=labels is not None,
-                PIXELS=_PIXELS,
+                -0.5 / sigma**2, reach, MAPPED=labels is not None, PIXELS=_PIXELS,
             )  # fmt: skip
         planes = blurred
     return planes
@@ -41,14 +39,14 @@ def blur(planes: Tensor, labels: Tensor | None, sigma: float, norm_sigma: float,
 
 @triton_function(warps=4)
 def _blur(
-    planes, labels, blurred, area, stride, length, labels_per_image, exponent, norm_exponent, reach,
+    planes, labels, blurred, area, stride, length, labels_per_image, exponent, reach,
     MAPPED: tl.constexpr, PIXELS: tl.constexpr,
 ):  # fmt: skip
     pixel = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     inside = pixel < area
     place = pixel // stride % length
     plane = tl.program_id(1)
-    scale = tl.where(plane == tl.num_programs(1) - 1, norm_exponent, exponent)
+    scale = tl.where(plane == tl.num_programs(1) - 1, 2.0 * exponent, exponent)
     image = tl.program_id(2).to(tl.int64)
     first = (image * tl.num_programs(1) + plane) * area
     total = tl.zeros([PIXELS], tl.float32)

@@ -6,6 +6,8 @@ of its blocks take 3 ms of these, with torch operations 6 ms.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -64,18 +66,15 @@ def _average(planes, labels, block, averages, tasks, counters):
         k = next_task(tasks, counters, k)
 
 
-def evaluate(
-    planes: Tensor, labels: Tensor | None, sigma: float, norm_sigma: float, reach: int
-) -> tuple[Tensor, Tensor]:
+def evaluate(planes: Tensor, labels: Tensor | None, sigma: float, reach: int) -> tuple[Tensor, Tensor]:
     """Filter planes of images along columns, then along rows, each time over pixels of the same label only.
 
     Args:
         planes: (B, K, H, W), contiguous, floating, on any device.
         labels: (B, H, W), or (1, H, W) for all images, contiguous, of the dtype of the planes; None: all pixels have
             the same label.
-        sigma: standard deviation of the filter, in pixels.
-        norm_sigma: standard deviation of the last plane's filter, in pixels.
-        reach: of both filters, in pixels.
+        sigma: standard deviation of the filter, in pixels; the last plane's filter is its square.
+        reach: of the filters, in pixels.
 
     Returns:
         For the first K - 1 filtered planes p and the last one n: the sum of p * p / n, (B, H, W), and p / n,
@@ -84,7 +83,8 @@ def evaluate(
     values = planes.cpu().numpy()
     marks = np.empty((0, 0, 0), values.dtype) if labels is None else labels.cpu().numpy()
     batch, count, height, _ = values.shape
-    taps = np.array([gaussian_taps(sigma, reach)] * (count - 1) + [gaussian_taps(norm_sigma, reach)])
+    # the square of a Gaussian is a Gaussian with sigma / sqrt(2)
+    taps = np.array([gaussian_taps(sigma, reach)] * (count - 1) + [gaussian_taps(sigma / math.sqrt(2.0), reach)])
     gain, colors = np.zeros_like(values[:, 0]), np.empty_like(values[:, 1:])
     arguments = values, marks, taps.astype(values.dtype), gain, colors
     run_tasks(lambda tasks, counters: _evaluate(*arguments, tasks, counters), ranges(batch * height, _ROWS))

@@ -73,7 +73,7 @@ class FitResult(NamedTuple):
             >>> batch.of_image(0).scene.num_gaussians, batch.of_image(1).scene.num_gaussians
             (0, 8)
         """
-        scene = self.scene[index]
+        index, scene = range(len(self.scene))[index], self.scene[index]
         field = scene.field.subset((scene.field.colors != 0).any(-1))
         numbers = (torch.as_tensor(values)[index].item() for values in (self.num_pruned, self.prune_error, self.psnr))
         num_pruned, prune_error, psnr = numbers

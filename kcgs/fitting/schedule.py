@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from kcgs.optim import Event
 
-from .events import AdaptContours, Densify, EndDrafts, SettleContours
+from .events import Densify, EndDrafts, SettleContours
 from .problem import Problem
 from .published.warmup import Warmup
 
 
 def make_schedule(problem: Problem) -> list[Event]:
     """Return the events, in the order in which they act."""
-    config, contours = problem.config, AdaptContours() if problem.config.move_contours else None
-    densify = problem.objects.densify or Densify(contours)
+    config, densify = problem.config, problem.objects.densify or Densify()
     events: list[Event] = [EndDrafts()]
     if config.warmup:
         events.append(Warmup())

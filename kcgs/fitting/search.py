@@ -28,9 +28,10 @@ from .state import FitState
 _FIRST_SPACING = 256
 # expected gain in PSNR for twice as many Gaussians, in dB, on photos
 _DECIBELS_PER_OCTAVE = 3.0
-# the search ends when the numbers of Gaussians that are enough and too few have at most this ratio
+# The search ends when the least number of Gaussians that is enough is at most this multiple of the largest number that
+# is too small.
 _PRECISION = 1.04
-# or when the curve expects to save less than this ratio
+# The search also ends when the secant predicts that less than this factor of Gaussians can be saved.
 _EXPECTED_PRECISION = 1.025
 # share of the schedule at which a continued fit starts
 _WARM_START = 0.6
@@ -78,8 +79,10 @@ def _fit(problem: Problem, count: int, trials: list[_Trial], seconds: float, run
     settings = config.model_copy(update=changes)
     nearest = min(trials, key=lambda t: abs(math.log(t.num_gaussians / count)), default=None)
     problem = replace(problem, num_gaussians=count, config=settings)
-    goes_on = nearest is not None and _can_go_on(problem, nearest)
-    state = _warm_start(problem, nearest.state) if nearest is not None and goes_on else start(problem)
+    if nearest is not None and _can_go_on(problem, nearest):
+        state = _warm_start(problem, nearest.state)
+    else:
+        state = start(problem)
     result = run(state)
     rendered = result.scene.render().to(problem.target).view_as(problem.target)
     return _Trial(count, float(psnr(rendered, problem.target)), result, state)

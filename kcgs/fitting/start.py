@@ -62,15 +62,9 @@ def make_state(
     """Return the state of a fit of a field that began with `num_initial` Gaussians."""
     config, optimizer = problem.config, make_optimizer(problem, field, initial_sigma(problem.size, num_initial))
     cutoff = draft_cutoff(config.cutoff) if optimizer.has_drafts else config.cutoff
-    return FitState(
-        field,
-        optimizer,
-        problem.objective,
-        Renderer(problem.size, regions, cutoff, config.backend, problem.bounds),
-        problem=problem,
-        num_initial=num_initial,
-        **{"num_requested": num_initial, **progress},
-    )
+    renderer = Renderer(problem.size, regions, cutoff, config.backend, problem.bounds)
+    progress = {"num_requested": num_initial, **progress}
+    return FitState(field, optimizer, problem.objective, renderer, problem=problem, num_initial=num_initial, **progress)
 
 
 def _regions_to_render(problem: Problem) -> RegionMap | None:

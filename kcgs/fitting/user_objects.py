@@ -14,6 +14,8 @@ from kcgs.optim import Event, FieldOptimizer, Loss
 
 Initializer = Callable[[Tensor, int, RegionMap | None, int], GaussianField]
 _OPTIMIZER_MEMBERS = tuple(name for name in vars(FieldOptimizer) if not name.startswith("_"))
+# a fit of one image freezes no rows
+_BATCH_MEMBERS = ("freeze", "frozen_rows")
 
 
 @runtime_checkable
@@ -75,24 +77,27 @@ def split_names(**arguments: object) -> tuple[dict[str, Any], UserObjects]:
 
 
 def check_initial(field: object, images: Tensor, num_gaussians: int, regions: RegionMap | None) -> GaussianField:
-    """Validate an initializer's field: `num_gaussians` Gaussians for each of the images."""
+    """Validate an initializer's field: `num_gaussians` Gaussians without opacities for each of the images."""
     batch, channels, *size = images.shape
-    expected = _layout((batch, num_gaussians, channels), tuple(size), regions is not None)
+    expected = _layout((batch, num_gaussians, channels), tuple(size), regions is not None, False)
     received = type(field).__name__
     if isinstance(field, GaussianField):
-        received = _layout(tuple(field.colors.shape), field.size, field.region_ids is not None)
+        has_ids, has_opacities = field.region_ids is not None, field.opacities is not None
+        received = _layout(tuple(field.colors.shape), field.size, has_ids, has_opacities)
         if received == expected:
             return field
     raise InvalidArgument("initializer", f"a function that returns a GaussianField of {expected}", received)
 
 
-def _layout(colors: tuple[int, ...], size: tuple[int, ...], has_ids: bool) -> str:
-    return f"colors {colors}, size {size} and {'' if has_ids else 'no '}region_ids"
+def _layout(colors: tuple[int, ...], size: tuple[int, ...], has_ids: bool, has_opacities: bool) -> str:
+    ids, opacities = ("" if has else "no " for has in (has_ids, has_opacities))
+    return f"colors {colors}, size {size}, {ids}region_ids and {opacities}opacities"
 
 
-def check_optimizer(optimizer: FieldOptimizer) -> FieldOptimizer:
-    """Validate that a user's optimizer has all members of a FieldOptimizer."""
-    if missing := [name for name in _OPTIMIZER_MEMBERS if not hasattr(optimizer, name)]:
-        expected = f"a function that returns an optimizer with {', '.join(_OPTIMIZER_MEMBERS)}"
+def check_optimizer(optimizer: FieldOptimizer, num_images: int) -> FieldOptimizer:
+    """Validate that a user's optimizer has the members of a FieldOptimizer that a fit of so many images calls."""
+    names = [name for name in _OPTIMIZER_MEMBERS if num_images > 1 or name not in _BATCH_MEMBERS]
+    if missing := [name for name in names if not hasattr(optimizer, name)]:
+        expected = f"a function that returns an optimizer with {', '.join(names)}"
         raise InvalidArgument("optimizer", expected, f"{type(optimizer).__name__} without {', '.join(missing)}")
     return optimizer

@@ -24,6 +24,7 @@ from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.functional import RegionMap, check_cholesky, from_tokens, lookup_regions, to_tokens
 
 _HALF = (torch.float16, torch.bfloat16)
+_TABLES = ("means", "cholesky", "colors", "region_ids", "opacities")
 
 
 class GaussianField(nn.Module):
@@ -78,11 +79,9 @@ class GaussianField(nn.Module):
         check_rows("cholesky", cholesky, means, 3)
         check_rows("colors", colors, means, "C")
         if opacities is not None and check_floating("opacities", opacities).shape != means.shape[:-1]:
-            raise ValueError(f"opacities must have shape {tuple(means.shape[:-1])}; got {tuple(opacities.shape)}")
-        self._register("means", means)
-        self._register("cholesky", cholesky)
-        self._register("colors", colors)
-        self._register("opacities", opacities)
+            raise InvalidArgument("opacities", f"{tuple(means.shape[:-1])}", tuple(opacities.shape), verb="have shape")
+        for name, table in (("means", means), ("cholesky", cholesky), ("colors", colors), ("opacities", opacities)):
+            self._register(name, table)
         self.register_buffer("region_ids", None if region_ids is None else self._checked_ids(region_ids))
 
     def _register(self, name: str, value: Tensor | None) -> None:
@@ -151,11 +150,7 @@ class GaussianField(nn.Module):
         return field if regions is None else field.assign_regions(regions)
 
     def assign_regions(self, regions: RegionMap | Tensor) -> GaussianField:
-        """Give every Gaussian the region under its centre, in place, and return the field.
-
-        Args:
-            regions: label map or RegionMap of the field's size.
-        """
+        """Give every Gaussian the region under its centre, in place, and return the field; the map has its size."""
         labels = regions.labels if isinstance(regions, RegionMap) else check_labels("regions", regions)
         ids = lookup_regions(self.means, labels)
         if tuple(labels.shape[-2:]) != self.size:
@@ -180,16 +175,13 @@ class GaussianField(nn.Module):
         """
         if self.num_images is not None:
             raise ValueError(f"subset needs an unbatched field; got means of shape {tuple(self.means.shape)}")
+        count = self.num_gaussians
         if check_tensor("mask", mask).dtype == torch.bool:
-            if mask.shape != (self.num_gaussians,):
-                raise ValueError(f"mask must have shape ({self.num_gaussians},); got {tuple(mask.shape)}")
-        else:
-            check_integer("mask", mask, dims=(1,))
-            if mask.numel() and not (0 <= int(mask.min()) and int(mask.max()) < self.num_gaussians):
-                raise ValueError(
-                    f"mask must hold indices in [0, {self.num_gaussians}); got {int(mask.min())}, {int(mask.max())}"
-                )
-
+            if mask.shape != (count,):
+                raise InvalidArgument("mask", f"shape ({count},)", tuple(mask.shape), verb="have")
+        elif check_integer("mask", mask, dims=(1,)).numel() and not 0 <= int(mask.min()) <= int(mask.max()) < count:
+            received = f"{int(mask.min())} to {int(mask.max())}"
+            raise InvalidArgument("mask", f"indices in [0, {count})", received, verb="hold")
         return self._select(mask)
 
     def __getitem__(self, index: int | slice) -> GaussianField:
@@ -233,8 +225,7 @@ class GaussianField(nn.Module):
                 raise InvalidArgument("fields", expected, f"one with {_describe(field)}")
         if not fields:
             raise InvalidArgument("fields", "at least one", "none", verb="hold")
-        names = ("means", "cholesky", "colors", "region_ids", "opacities")
-        columns = ([getattr(field, name) for field in fields] for name in names)
+        columns = ([getattr(field, name) for field in fields] for name in _TABLES)
         tensors = (None if column[0] is None else torch.stack(column).detach() for column in columns)
         return cls(*tensors, size=fields[0].size)  # type: ignore[arg-type]
 
@@ -243,8 +234,8 @@ class GaussianField(nn.Module):
         return [self[index] for index in range(len(self.means))]
 
     def _select(self, index: int | slice | Tensor) -> GaussianField:
-        tensors = (self.means, self.cholesky, self.colors, self.region_ids, self.opacities)
-        parts = (None if tensor is None else tensor.detach()[index] for tensor in tensors)
+        tables = (getattr(self, name) for name in _TABLES)
+        parts = (None if table is None else table.detach()[index] for table in tables)
         return GaussianField(*parts, size=self.size)  # type: ignore[arg-type]
 
     def tokens(self) -> Tensor:
@@ -289,23 +280,24 @@ class GaussianField(nn.Module):
             >>> torch.allclose(Scene(field.hflip())(), Scene(field)().flip(-1), atol=1e-5)
             True
         """
-        return self._mirrored(0)
+        return self._mirror(0)
 
     def vflip(self) -> GaussianField:
         """Return the field of the image that is flipped upside down, exactly, with the graph."""
-        return self._mirrored(1)
+        return self._mirror(1)
 
     def shift(self, x: float, y: float) -> GaussianField:
         """Return the field moved by so many pixels to the right and down, with the graph."""
-        means = self.means + self.means.new_tensor([x, y])
-        return GaussianField(means, self.cholesky, self.colors, self.region_ids, self.opacities, size=self.size)
+        return self._with_geometry(self.means + self.means.new_tensor([x, y]), self.cholesky)
 
-    def _mirrored(self, axis: int) -> GaussianField:
+    def _mirror(self, axis: int) -> GaussianField:
         """Mirror x (0) or y (1): the variances stay, and the covariance of x and y changes its sign."""
         signs, offsets = self.means.new_ones(2), self.means.new_zeros(2)
         signs[axis], offsets[axis] = -1.0, self.size[1 - axis]
         cholesky = self.cholesky * self.cholesky.new_tensor([1.0, -1.0, 1.0])
-        means = offsets + signs * self.means
+        return self._with_geometry(offsets + signs * self.means, cholesky)
+
+    def _with_geometry(self, means: Tensor, cholesky: Tensor) -> GaussianField:
         return GaussianField(means, cholesky, self.colors, self.region_ids, self.opacities, size=self.size)
 
     def merged_colors(self) -> Tensor:
@@ -323,7 +315,7 @@ class GaussianField(nn.Module):
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         means = state_dict.get(f"{prefix}means")
         if means is not None and means.shape != self.means.shape:
-            raise InvalidArgument("state_dict", f"of {_describe_rows(self.means)}", _describe_rows(means))
+            raise InvalidArgument("state_dict", f"means {tuple(self.means.shape)}", tuple(means.shape), verb="hold")
         # torch ignores a buffer that is None: ids, or their absence, come from the state
         ids = state_dict.get(f"{prefix}region_ids")
         if ids is None and f"{prefix}means" in state_dict:
@@ -352,7 +344,3 @@ class GaussianField(nn.Module):
 
 def _describe(field: GaussianField) -> str:
     return f"{field.extra_repr()}, {'no ' if field.opacities is None else ''}opacities"
-
-
-def _describe_rows(means: Tensor) -> str:
-    return f"{' x '.join(map(str, means.shape[:-1]))} Gaussians"

@@ -44,13 +44,7 @@ class RegionSplatRenderer(nn.Module):
         (torch.Size([3, 32, 48]), torch.Size([3, 64, 96]))
     """
 
-    def __init__(
-        self,
-        cutoff: float = 1e-4,
-        clamp: bool = False,
-        backend: str = "auto",
-        keepdim: bool = True,
-    ) -> None:
+    def __init__(self, cutoff: float = 1e-4, clamp: bool = False, backend: str = "auto", keepdim: bool = True) -> None:
         super().__init__()
         self.cutoff = check_cutoff(cutoff)
         self.clamp = clamp

@@ -4,7 +4,6 @@ from .adam import is_within
 from .descent import FieldOptimizer, FieldState, move_field, set_rates, step_field
 from .gaussian_adam import COLOR_LEARNING_RATE, LEARNING_RATE, GaussianAdam
 from .gaussians import Gaussians, Renderer, draft_cutoff
-from .ms_ssim import MsSsim
 from .newton import NewtonDescent, self_product
 from .objectives import ImageObjective, Loss, LossObjective, Objective, SquaredError
 from .registry import OBJECTIVES

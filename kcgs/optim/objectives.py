@@ -74,9 +74,12 @@ class Objective(ABC):
 
 
 class ImageObjective(Objective):
-    """An error of a render against an image, (..., C, H, W); subclasses say of which kind."""
+    """An error of a render against an image, (..., C, H, W); subclasses say of which kind.
 
-    def __init__(self, image: Tensor) -> None:
+    `reduction` is the factor by which the sides of a photo were reduced to those of the image; few errors depend on it.
+    """
+
+    def __init__(self, image: Tensor, reduction: int = 1) -> None:
         self.image = image
 
     def residual(self, render: Tensor) -> Residual:
@@ -87,7 +90,7 @@ class ImageObjective(Objective):
 class SquaredError(ImageObjective):
     """The squared error, with an optional weight of each pixel, (H, W)."""
 
-    def __init__(self, image: Tensor, weight: Tensor | None = None) -> None:
+    def __init__(self, image: Tensor, reduction: int = 1, *, weight: Tensor | None = None) -> None:
         super().__init__(image)
         self.weight = weight
         self.power = 2 if weight is None else None

@@ -16,16 +16,20 @@ from .flow import sample
 _FRINGE = 3
 # a Gaussian follows a motion if it is at most this far from the place that the motion predicts, in pixels
 _MAX_RESIDUAL = 1.0
-# samples of three rows; with more samples the motion of most rows is found more reliably
+# motions that are tried, each of three rows; more trials take longer and miss the motion of most rows less often
 _RANSAC_TRIALS = 200
-# least number of rows that determine a motion reliably
+# with fewer rows the motion between two frames is not estimated: the background counts as still
 _MIN_ROWS = 12
 
 
 def affine_motions(means: Tensor, background: Tensor) -> Tensor:
-    """Return the affine motions (T, 3, 3) from the first frame to each frame, of most rows of `background` (T, N).
+    """Estimate the affine motion of the background from the first frame to each frame, (T, 3, 3).
 
-    The fit follows optical flow, which ends where a region hides the background; an affine motion goes on behind it.
+    Gaussians follow optical flow, which ends where a region hides the background. An affine motion continues there.
+
+    Args:
+        means: (T, N, 2).
+        background: mask of the rows that belong to the background, bool (T, N); most of them have the same motion.
     """
     from skimage.measure import ransac
     from skimage.transform import AffineTransform
@@ -85,7 +89,7 @@ class _Pixels(NamedTuple):
 
 
 def _copy(source: _Pixels, target: _Pixels, motion: Tensor) -> None:
-    """Fill unknown pixels of the target, in place, from their places in the source by a motion, if known there."""
+    """Copy to each unknown pixel of the target, in place, the pixel of the source to which a motion leads, if known."""
     y, x = target.unknown.nonzero().T
     points = apply_affine(motion, torch.stack([x, y], -1).to(target.image) + 0.5)
     cols, rows = points.floor().long().unbind(-1)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcgs.compiled import threads_for_kernels
 from kcgs.editing import check_offset, shift_labels, unique_region_ids, warn_of_lost_regions
-from kcgs.fitting import FitConfig
+from kcgs.fitting import FitConfig, config_for
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField, join
 from kcgs.optim import Gaussians
@@ -51,9 +51,9 @@ def delete_from_video(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
     """
     regions, row_ids, deleted_ids = _check(scenes, region_ids)
     deleted_pixels, deleted_rows = torch.isin(regions.labels, deleted_ids), torch.isin(row_ids, deleted_ids)
-    # scenes do not store the config of their fit: a descent uses only its objective, backend and cutoff, and the
-    # defaults of the latter two suit every scene
-    config, frames = FitConfig(objective="l2"), list[Scene]()
+    # scenes do not store the settings of their fit; a descent without moves of contours uses only the objective, the
+    # backend and the cutoff
+    config, frames = config_for("video", FitConfig()), list[Scene]()
     with threads_for_kernels(scenes.size[0] * scenes.size[1]):
         motions = affine_motions(scenes.field.means.detach(), ~deleted_rows)
         images, labels = restore_background(scenes.render(), regions.labels, deleted_pixels, motions)

@@ -16,7 +16,7 @@ from torch import Tensor
 from kcgs._atomic import atomic_path
 from kcgs._check import check_number
 from kcgs._image import as_image
-from kcgs._suffixes import LABEL_MAPS, WRITTEN_IMAGES
+from kcgs._suffixes import LABEL_MAPS, VIDEOS, WRITTEN_IMAGES
 from kcgs.data import load_image, load_labels, save_image
 
 # frames per second if a file or an iterable has no rate
@@ -142,6 +142,8 @@ def write_video(path: str | os.PathLike[str], frames: Iterable[Any], frame_rate:
         ['00000.png', '00001.png']
     """
     rate = check_number("frame_rate", frame_rate, 0, above=True)
+    if Path(path).suffix.lower() not in ("", *VIDEOS):
+        raise ValueError(f"path must end in {', '.join(VIDEOS)}, or have no suffix; got {str(path)!r}")
     images = _check_frames(frames)
     first = next(images)  # checked before anything is written
     images = chain([first], images)

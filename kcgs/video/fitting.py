@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from kcgs._objectives import objective_for
 from kcgs._progress import Progress
 from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
-from kcgs.fitting import FitConfig, check_image_and_regions, check_num_gaussians, fit
+from kcgs.fitting import FitConfig, check_image_and_regions, check_num_gaussians, config_for, fit
 from kcgs.functional import RegionMap, lookup_regions
 from kcgs.nn import pad_rows
 from kcgs.optim import Gaussians
@@ -86,8 +85,8 @@ def fit_video(
 
     Raises:
         TypeError: wrong types.
-        ValueError: as :func:`kcgs.fit`; an objective that is neither l2 nor ms-ssim, such as a recipe's; no frames;
-            a frame of another size, or without a label map.
+        ValueError: as :func:`kcgs.fit`; an objective that is neither l2 nor ms-ssim, such as a recipe's; `bounded`; no
+            frames; a frame of another size, or without a label map.
 
     Example:
         >>> frames = [torch.zeros(3, 16, 24) for _ in range(3)]
@@ -97,8 +96,7 @@ def fit_video(
         >>> len(scenes), scenes.num_gaussians, scenes.render().shape
         (3, 8, torch.Size([3, 3, 16, 24]))
     """
-    config = FitConfig.from_recipe(recipe, **({"merge_regions": False} | settings))
-    config = config.model_copy(update={"objective": objective_for("video", config.objective)})
+    config = config_for("video", FitConfig.from_recipe(recipe, **({"merge_regions": False} | settings)))
     video = _VideoFit(config, num_gaussians, seed)
     length = len(frames) if isinstance(frames, Sized) else None
     with Progress("fit-video", pulse=length is None, visible=progress) as bar:

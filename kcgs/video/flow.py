@@ -18,11 +18,15 @@ _ITERATIONS = 5
 def optical_flow(previous: Tensor, image: Tensor) -> Tensor:
     """Return the offset (x, y) from each pixel of an image to its place in the previous image, (2, H, W), in pixels.
 
+    An image with a side of one pixel has no slope along it: its offsets are 0.
+
     Source: the iterative Lucas-Kanade solver of scikit-image, `optical_flow_ilk`, on reduced grey images.
     """
     from skimage.registration import optical_flow_ilk
 
     height, width = image.shape[1:]
+    if min(height, width) == 1:
+        return image.new_zeros(2, height, width)
     scale = min(1.0, _SIDE / min(height, width))
     size = max(1, round(height * scale)), max(1, round(width * scale))
     grey = [

@@ -77,6 +77,27 @@ def test_batches_are_tensors_in_the_order_of_the_sampler(
     assert (batches[0].region_ids is None) != has_maps
 
 
+@pytest.mark.parametrize("largest", [(7, 300), (300, 300), (300, 70_000)])
+def test_batches_of_shards_with_ids_of_other_types(largest: tuple[int, int], tmp_path: Path) -> None:
+    for number, region in enumerate(largest):
+        labels = region * (torch.arange(24) >= 12).long().expand(2, *SIZE)
+        scenes = Scene(scenes_of(2).field.assign_regions(labels), labels)
+        save_shard(tmp_path / f"0000{number}.safetensors", scenes, "ab", [20.0, 21.0])
+    dataset = SceneDataset(tmp_path)
+    batch = dataset.__getitems__([3, 0])
+    assert batch.region_ids.amax(1).tolist() == [largest[1], largest[0]] and batch.region_ids.dtype == torch.int64
+    assert dataset[3].field.region_ids.unique().tolist() == [0, largest[1]]
+
+
+@pytest.mark.parametrize("num_maps", [None, 1])
+def test_one_map_of_all_images(num_maps: int | None, tmp_path: Path) -> None:
+    labels = (torch.arange(24) >= 12).long().expand(SIZE)
+    regions = RegionMap(labels if num_maps is None else labels[None], 0.5)
+    scenes = Scene(scenes_of(2).field.assign_regions(labels), regions)
+    save_shard(tmp_path / "00000.safetensors", scenes, "ab", [20.0, 21.0])
+    torch.testing.assert_close(SceneDataset(tmp_path)[1].render(), scenes[1].render())
+
+
 def test_a_copy_opens_the_files_itself(tmp_path: Path) -> None:
     write(tmp_path)
     dataset = SceneDataset(tmp_path)
@@ -115,12 +136,23 @@ def test_what_is_no_data_set(tmp_path: Path) -> None:
         save_shard(tmp_path / "train.safetensors", scenes_of(2), "ab", [1.0, 2.0])
     with pytest.raises(ValueError, match="names must be one for each of 2 scenes; got 3"):
         save_shard(tmp_path / "00002.safetensors", scenes_of(2), "abc", [1.0, 2.0])
+    with pytest.raises(ValueError, match=r"psnr must be numbers of dB; got \[1.0, nan\]"):
+        save_shard(tmp_path / "00002.safetensors", scenes_of(2), "ab", [1.0, torch.nan])
+    with pytest.raises(TypeError, match="scenes must be a batch of scenes; got list"):
+        save_shard(tmp_path / "00002.safetensors", [*scenes_of(2)], "ab", [1.0, 2.0])  # type: ignore[arg-type]
 
 
 def test_an_image_without_error(tmp_path: Path) -> None:
     save_shard(tmp_path / "00000.safetensors", scenes_of(2), "ab", torch.tensor([20.0, torch.inf]))
     assert SceneDataset(tmp_path).psnr.tolist() == [20.0, torch.inf]
     assert load(tmp_path / "00000.safetensors").metadata["psnr"] == "[20.0, null]"
+
+
+def test_notes_of_the_scenes_and_of_the_file(tmp_path: Path) -> None:
+    scenes = Scene(scenes_of(2).field, metadata={"frame_rate": "24", "camera": "a"})
+    save_shard(tmp_path / "00000.safetensors", scenes, "ab", [20.0, 21.0], {"camera": "b"})
+    notes = load(tmp_path / "00000.safetensors").metadata
+    assert (notes["frame_rate"], notes["camera"]) == ("24", "b")
 
 
 def test_indices_and_devices(tmp_path: Path) -> None:

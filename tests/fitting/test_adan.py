@@ -79,17 +79,6 @@ class TestAlgorithm:
         assert np.abs(expected - START).max() > 0.5 * settings.get("lr", 1e-3)
         np.testing.assert_allclose(point.detach().numpy(), expected, rtol=0, atol=1e-13)
 
-    def test_finds_the_minimum_of_a_bowl(self) -> None:
-        point, goal = parameter(), torch.tensor([0.5, -0.25, 2.0, 0.0], dtype=torch.float64)
-        optimizer = Adan([point], lr=0.05)
-        schedule = torch.optim.lr_scheduler.StepLR(optimizer, 100, 0.5)
-        for _ in range(1000):
-            optimizer.zero_grad()
-            (point - goal).square().sum().backward()
-            optimizer.step()
-            schedule.step()
-        torch.testing.assert_close(point.detach(), goal, atol=1e-3, rtol=0)
-
 
 class TestOptimizer:
     @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -105,6 +105,7 @@ def test_an_image_that_diverges_keeps_its_best_and_the_others_go_on() -> None:
     with pytest.warns(UserWarning, match="image 1 of the batch diverged at iteration 31: the best so far is kept"):
         result = fit(photos(), optimizer=Faulty, **settings)
     assert result.stop_reason == "iterations" and result.diverged == (1,)
+    assert [result.of_image(image).diverged for image in (0, 1, -3)] == [(), (0,), (0,)]
     for k in (0, 2, 3):
         for actual, values in zip(
             rows_in_use(result.scene[k].field), rows_in_use(expected.scene[k].field), strict=True

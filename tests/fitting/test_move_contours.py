@@ -14,8 +14,8 @@ from torch import Tensor
 
 from kcgs import GaussianField, RegionMap, Scene, fit
 from kcgs.data import load_image, load_labels
-from kcgs.fitting.contour_energy import MovingLabels, bounding_boxes, disc, index_map, region_costs
-from kcgs.fitting.contour_loops import NOT_COUNTED, piece_energy
+from kcgs.fitting.contour_energy import bounding_boxes, disc, index_map, region_costs
+from kcgs.fitting.contour_loops import piece_energy
 from kcgs.fitting.contour_moves import refine_contours
 from kcgs.functional import edge_band, psnr, region_splat
 
@@ -306,23 +306,6 @@ class TestShape:
         for start in (image, bumpy):
             regions = RegionMap.from_labels((start[0] > 0).long())
             assert torch.equal(refine_contours(Scene(field, regions), bumpy, blur=0.0).labels, labels)
-
-    @pytest.mark.parametrize("seed", range(6))
-    def test_what_a_sweep_leaves_to_the_next_changes_no_label(self, seed: int) -> None:
-        """Pixels near which nothing has changed are not visited again."""
-        field, image, regions = noisy_problem(seed)
-        index, (_, height, width) = regions.index[0].numpy(), image.shape
-        with torch.no_grad():
-            boxes = np.tile([0, height, 0, width], (regions.num_regions, 1))
-            costs = region_costs(Scene(field, regions), image, boxes, 4, 0.7, "auto")
-        kept, fresh = (MovingLabels(index, costs, 0.003, 4, 1) for _ in range(2))
-        num_due = []
-        for _ in range(4):
-            num_due.append(int((kept._sweeps.pending > 0).sum()))
-            fresh._sweeps.pending[:], fresh._sweeps.excess[:] = 1, NOT_COUNTED
-            assert kept.sweep(1 + seed % 3) == fresh.sweep(1 + seed % 3)
-            assert np.array_equal(kept.map, fresh.map)
-        assert num_due[-1] < num_due[0]
 
     def test_one_region_returns_the_map(self) -> None:
         regions = RegionMap.from_labels(torch.full((24, 40), 7))

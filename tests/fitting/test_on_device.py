@@ -17,9 +17,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from kcgs import FitConfig, fit
 from kcgs.fitting import FitResult, fit_problem
 from kcgs.fitting.events import contours
-from kcgs.fitting.measurement import measure_errors
+from kcgs.fitting.measurement import Errors, measure_errors
 from kcgs.fitting.problem import make_problem
-from kcgs.fitting.state import Errors, FitState
+from kcgs.fitting.state import FitState
 from kcgs.fitting.steppers import CudaStepper, EagerStepper
 from kcgs.fitting.steppers.graph import StepGraph
 from kcgs.fitting.steppers.readback import Readback

@@ -161,12 +161,19 @@ def test_first_gaussians_of_ones_own(num_images: int, regions: Tensor | None) ->
     ("field", "words"),
     [
         (None, "NoneType"),
-        (GaussianField.random(3, (32, 40), seed=0), r"colors \(3, 3\), size \(32, 40\) and no region_ids"),
-        (initial_field(image()[None], 3, LABELS), r"colors \(1, 3, 3\), size \(32, 40\) and region_ids"),
+        (
+            GaussianField.random(3, (32, 40), seed=0),
+            r"colors \(3, 3\), size \(32, 40\), no region_ids and no opacities",
+        ),
+        (initial_field(image()[None], 3, LABELS), r"colors \(1, 3, 3\), size \(32, 40\), region_ids and no opacities"),
+        (
+            GaussianField(*(torch.ones(1, 1, n) for n in (2, 3, 3)), opacities=torch.ones(1, 1), size=(32, 40)),
+            r"colors \(1, 1, 3\), size \(32, 40\), no region_ids and opacities",
+        ),
     ],
 )
 def test_first_gaussians_that_do_not_fit(field: object, words: str) -> None:
-    expected = r"a GaussianField of colors \(1, 1, 3\), size \(32, 40\) and no region_ids"
+    expected = r"a GaussianField of colors \(1, 1, 3\), size \(32, 40\), no region_ids and no opacities"
     with pytest.raises(ValueError, match=f"^initializer must be a function that returns {expected}; got {words}$"):
         fit(image(), None, 60, initializer=lambda *arguments: field)
 
@@ -208,9 +215,29 @@ def test_an_optimizer_that_keeps_no_averages_is_not_gone_on_with() -> None:
 
 
 def test_an_optimizer_without_a_rate() -> None:
-    words = "an optimizer with param_groups, .*; got Adam without has_drafts, keeps_averages, rate, append, keep, "
-    with pytest.raises(ValueError, match=f"^optimizer must be a function that returns {words}freeze, frozen_rows$"):
-        fit(image(), None, 9, optimizer=lambda field: torch.optim.Adam(field.parameters()))
+    words = "an optimizer with param_groups, .*; got Adam without has_drafts, keeps_averages, rate, append, keep"
+    for images, more in ((image(), ""), (torch.stack([image()] * 2), ", freeze, frozen_rows")):
+        with pytest.raises(ValueError, match=f"^optimizer must be a function that returns {words}{more}$"):
+            fit(images, None, 9, optimizer=lambda field: torch.optim.Adam(field.parameters()))
+
+
+def test_an_optimizer_for_one_image_freezes_no_rows() -> None:
+    class Adam:
+        def __init__(self, field: GaussianField) -> None:
+            self._adam = GaussianAdam(field)
+
+        def __getattr__(self, name: str) -> Any:
+            if name in ("freeze", "frozen_rows"):
+                raise AttributeError(name)
+            return getattr(self._adam, name)
+
+    own, named = (fit(image(), LABELS, 30, iterations=40, optimizer=value) for value in (Adam, None))
+    assert torch.equal(own.scene.render(), named.scene.render())
+
+
+def test_an_optimizer_of_ones_own_is_not_bounded_by_a_setting() -> None:
+    with pytest.raises(ValueError, match="bounded must be False with an optimizer of your own; got True"):
+        fit(image(), None, 9, bounded=True, optimizer=GaussianAdam)
 
 
 def test_an_event_that_adds_too_many_and_one_that_ends_the_fit() -> None:

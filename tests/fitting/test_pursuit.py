@@ -274,7 +274,7 @@ class TestTriton:
         constants = {"MAPPED": has_labels, "PIXELS": cuda._PIXELS}
         integers = ("area", "stride", "length", "labels_per_image", "reach")
         types = {**dict.fromkeys(constants, "constexpr"), **dict.fromkeys(integers, "i32")}
-        types |= dict.fromkeys(("exponent", "norm_exponent"), "fp32")
+        types["exponent"] = "fp32"
         signature = {name: types.get(name, "*fp32") for name in cuda._blur.jit.arg_names}
         source = triton.compiler.ASTSource(cuda._blur.jit, signature, constants)
         triton.compile(source, target=GPUTarget("cuda", capability, 32), options=cuda._blur.options)

@@ -32,7 +32,7 @@ def autograd(objective: Objective) -> Tensor:
     ("objective", "factor"),
     [
         (SquaredError(IMAGE), 0.5),
-        (SquaredError(IMAGE, WEIGHT), 0.5),
+        (SquaredError(IMAGE, weight=WEIGHT), 0.5),
         (AbsoluteError(IMAGE), 1.0),
         (LossObjective(mean_fourth_power), 1.0),
     ],
@@ -47,7 +47,7 @@ def test_values_with_a_power_are_means_of_it(kind: type[SquaredError | AbsoluteE
     objective = kind(IMAGE)
     assert objective.power == power
     torch.testing.assert_close(objective.value(RENDER), (RENDER - IMAGE).abs().pow(power).mean())
-    assert SquaredError(IMAGE, WEIGHT).power is None
+    assert SquaredError(IMAGE, weight=WEIGHT).power is None
 
 
 @pytest.mark.parametrize("kind", [SquaredError, AbsoluteError])

@@ -141,6 +141,7 @@ class TestEditing(BaseTester):
             (lambda s: render_region(Scene(GaussianField.random(3, SIZE), s.regions), BOX), ValueError, "region ids"),
             (lambda s: render_region(Scene(s.field, shapes().expand(2, -1, -1)), BOX), ValueError, "hold 1 map"),
             (lambda s: render_over(s, BOX, torch.zeros(1, 4, 4)), ValueError, r"shape \(3, H, W\)"),
+            (lambda s: replace_background(scene_of(RESIZED), BOX, s), ValueError, "must not have a resized map"),
             (lambda s: replace_background(s, BOX, torch.zeros(3, 4, 4)), TypeError, "background must be a Scene"),
             (lambda s: replace_background(s, BOX, grey()), ValueError, "background must have 3 channels; got 1"),
         ],

@@ -157,6 +157,7 @@ class TestExceptions:
             (".", FileExistsError, "expected a new or an empty folder"),
             ("none/clip", FileNotFoundError, "none"),
             ("none/a.mp4", FileNotFoundError, "none"),
+            ("a.avi", ValueError, r"path must end in .mp4, .mov, .mkv, or have no suffix; got '.*a.avi'"),
         ],
     )
     def test_output_folders(self, tmp_path: Path, name: str, error: type[Exception], match: str) -> None:

@@ -111,6 +111,15 @@ class TestFitVideo:
         with pytest.raises(ValueError, match=match):
             fit_video(frames, maps, 8, iterations=2)
 
+    @pytest.mark.parametrize("size", [(1, 5), (5, 1), (2, 2)])
+    def test_tiny_frames(self, size: tuple[int, int]) -> None:
+        frames = torch.rand(2, 3, *size, generator=torch.Generator().manual_seed(0))
+        assert fit_video(frames, None, 3, iterations=5).render().shape == (2, 3, *size)
+
+    def test_bounded(self) -> None:
+        with pytest.raises(ValueError, match="bounded must be False for a video; got True"):
+            fit_video(FRAMES, None, 8, iterations=2, bounded=True)
+
 
 class TestInterpolate:
     @pytest.mark.parametrize("number", [0, 1])

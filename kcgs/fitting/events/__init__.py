@@ -5,13 +5,11 @@ An event that changes the scene is a frozen dataclass, and its fields are thresh
 ``keep`` of the state's optimizer. Other events only observe.
 """
 
-from .contours import AdaptContours, SettleContours
+from .contours import SettleContours
 from .densify import Densify
 from .divergence import HandleDivergence
 from .drafts import EndDrafts
 from .log import Log
 from .report import OnStep, Report
 
-__all__ = [
-    "AdaptContours", "Densify", "EndDrafts", "HandleDivergence", "Log", "OnStep", "Report", "SettleContours",
-]  # fmt: skip
+__all__ = ["Densify", "EndDrafts", "HandleDivergence", "Log", "OnStep", "Report", "SettleContours"]

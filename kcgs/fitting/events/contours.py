@@ -1,4 +1,4 @@
-"""The events that move contours, during and after densification."""
+"""Moves of contours: before additions of Gaussians, and as an event after densification."""
 
 from __future__ import annotations
 
@@ -20,27 +20,21 @@ from kcgs.optim import Gaussians
 _CLOCK_SHARE = 0.25
 # seconds per pixel that the first move is expected to take
 _SECONDS_PER_PIXEL = 3e-7
+# factor by which a move before an addition may raise the squared error around it: the Gaussians adapt to it later
+_MAX_RISE = 1.5
+# contours move before every second addition of Gaussians
+_ADDITIONS_PER_MOVE = 2
+# their softness is chosen again before the second addition of every four
+_ADDITIONS_PER_SOFTNESS = 4
 
 
-@dataclass(frozen=True)
-class AdaptContours:
-    """Move the contours before some additions of Gaussians; the event `Densify` calls it."""
-
-    max_rise: float = 1.5
-    """Factor by which a move may raise the squared error around it; the Gaussians adapt to it later."""
-    additions_per_move: int = 2
-    """Contours move before every second addition."""
-    additions_per_softness: int = 4
-    """The softness of contours is chosen again before every fourth addition, if the settings ask for it."""
-
-    def adapt(self, state: FitState) -> None:
-        """Move the contours, and choose their softness, where this is due before the current addition."""
-        if state.num_additions % self.additions_per_move:
-            return
-        _move_contours(state, self.max_rise)
-        is_turn = state.num_additions % self.additions_per_softness == self.additions_per_move
-        if state.regions is not None and is_turn:
-            _replace_maps(state, _choose_softness)
+def adapt_contours(state: FitState) -> None:
+    """Move the contours before some additions of Gaussians; choose their softness again if the settings ask for it."""
+    if state.num_additions % _ADDITIONS_PER_MOVE:
+        return
+    _move_contours(state, _MAX_RISE)
+    if state.regions is not None and state.num_additions % _ADDITIONS_PER_SOFTNESS == _ADDITIONS_PER_MOVE:
+        _replace_maps(state, _choose_softness)
 
 
 def _replace_maps(state: FitState, replace: Callable[[FitState, int, RegionMap], RegionMap]) -> None:

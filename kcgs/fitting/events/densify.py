@@ -10,7 +10,7 @@ from kcgs.fitting.pursuit import add_gaussians
 from kcgs.fitting.removal import remove_gaussians
 from kcgs.fitting.state import FitState
 
-from .contours import AdaptContours
+from .contours import adapt_contours
 
 
 @dataclass(frozen=True)
@@ -19,11 +19,9 @@ class Densify:
 
     First the number of Gaussians grows beyond N. Then cycles follow: each removes Gaussians of the lowest impact, in
     several steps, until N are left, and the next cycle adds as many again. So the positions of N Gaussians are chosen
-    several times, each time given the others.
+    several times, each time given the others. While the number grows, contours move before additions.
     """
 
-    contours: AdaptContours | None = None
-    """Moves the contours before additions while the number of Gaussians grows."""
     steps: int = 8
     """Number of additions until the number of Gaussians is largest."""
     begin: float = 0.05
@@ -69,8 +67,8 @@ class Densify:
             remove_gaussians(state, state.num_gaussians - target)
         else:
             state.num_additions += 1
-            if self.contours is not None and state.progress < self.end:
-                self.contours.adapt(state)
+            if state.problem.config.move_contours and state.progress < self.end:
+                adapt_contours(state)
             self.add(state, target - state.num_gaussians)
         state.num_requested = target
 

@@ -15,15 +15,7 @@ OnStep = Callable[[int, HistoryEntry], bool | None]
 
 
 class Report:
-    """Report every step after the first measurement; end the fit when the callback returns True.
-
-    Args:
-        stepper: of the fit.
-        clock: of the fit.
-        bar: shows the last measurement.
-        on_step: the user's callback.
-        checkpoint: stores the state.
-    """
+    """Report every step after the first measurement; end the fit when the user's callback returns True."""
 
     def __init__(
         self, stepper: Stepper, clock: Clock, bar: Progress, on_step: OnStep | None, checkpoint: Checkpoint | None

@@ -10,8 +10,8 @@ from operator import is_not
 import torch
 from torch import Tensor
 
-from kcgs.fitting.measurement import measure_errors, snapshot
-from kcgs.fitting.state import LARGEST, Errors, FitState, Measurement, record
+from kcgs.fitting.measurement import Errors, Measurement, measure_errors, record, snapshot
+from kcgs.fitting.state import LARGEST, FitState
 from kcgs.kernels import settle, without_waiting
 from kcgs.optim import move_field, set_rates
 

@@ -6,8 +6,8 @@ from typing import Protocol
 
 from torch import Tensor
 
-from kcgs.fitting.measurement import measure_errors, snapshot
-from kcgs.fitting.state import FitState, record
+from kcgs.fitting.measurement import measure_errors, record, snapshot
+from kcgs.fitting.state import FitState
 from kcgs.optim import step_field
 
 
