@@ -29,6 +29,31 @@ _QUALITY_MARGIN = 14.5
 # dB that are added to the quality until a file reaches `target_psnr`
 _QUALITY_STEPS = (0.0, 2.0, 5.0, 9.0, 14.0, 20.0, 30.0, 50.0)
 
+# These numbers are tuned: change one and compare the files of `python -m benchmarks rate`, which have the same size.
+
+# share of the iterations before rounding starts; in the others the descent goes on while Gaussians are rounded. More:
+# Gaussians are cheaper, and their neighbours correct less of the rounding errors
+_DESCENT_SHARE = 0.7
+# iterations between two updates of the QP, each of which writes a file. More: faster, and farther from the target
+_UPDATE_INTERVAL = 70
+# share of the descent after which Gaussians are pruned that save less error than their bits cost. More: they have more
+# time to become useful, and the others have less time to replace them
+_PRUNE_FROM = 0.8
+# size that the descent aims at, as a share of `target_bytes`: gradual rounding saves 0.6 %
+_DESCENT_AIM = 1.006
+# size that rounding aims at, as a share of `target_bytes`; excess Gaussians are removed on the way. More: more
+# Gaussians are removed. Less: more files are too small and are rounded again
+_ROUNDING_AIM = 1.01
+# share of `target_bytes` that is large enough. More: slower, and less error
+_MIN_FILL = 0.995
+# largest number of roundings of a scene until a file has `_MIN_FILL`
+_MAX_ROUNDINGS = 3
+# largest number of files that are written to find the QP of the first rounding
+_MAX_SECANTS = 4
+# factor on the change of size that an update of the QP aims at: numbers that round to 0 take no more bits when their
+# steps become finer. More: the size oscillates. Less: it lags behind
+_BYTES_GAIN = 1.3
+
 
 @brief
 class Compressed(NamedTuple):
@@ -127,42 +152,6 @@ def quality_for(psnr: float) -> float:
 
 
 @dataclass(frozen=True)
-class CompressionSchedule:
-    """The division of the iterations into phases, and the sizes that each phase aims at for `target_bytes`.
-
-    All fields are tuned. To tune one again, change it and compare the files of ``python -m benchmarks rate``: all have
-    the same size.
-    """
-
-    descent_share: float = 0.7
-    """Share of the iterations before rounding starts; in the others the descent goes on while Gaussians are rounded.
-    More: Gaussians are cheaper, and their neighbours correct less of the rounding errors."""
-    update_interval: int = 70
-    """Iterations between two updates of the QP, each of which writes a file. More: faster, and farther from the
-    target."""
-    prune_from: float = 0.8
-    """Share of the descent after which Gaussians are pruned that save less error than their bits cost. More: they have
-    more time to become useful, and the others have less time to replace them."""
-    descent_aim: float = 1.006
-    """Size that the descent aims at, as a share of `target_bytes`: gradual rounding saves 0.6 %."""
-    rounding_aim: float = 1.01
-    """Size that rounding aims at, as a share of `target_bytes`; excess Gaussians are removed on the way. More: more
-    Gaussians are removed. Less: more files are too small and are rounded again."""
-    min_fill: float = 0.995
-    """Share of `target_bytes` that is large enough. More: slower, and less error."""
-    max_roundings: int = 3
-    """Largest number of roundings of a scene until a file has `min_fill`."""
-    max_secants: int = 4
-    """Largest number of files that are written to find the QP of the first rounding."""
-    bytes_gain: float = 1.3
-    """Factor on the change of size that an update of the QP aims at: numbers that round to 0 take no more bits when
-    their steps become finer. More: the size oscillates. Less: it lags behind."""
-
-
-_SCHEDULE = CompressionSchedule()
-
-
-@dataclass(frozen=True)
 class Compressor:
     """Rate-distortion descent and gradual rounding of one scene, at any quantization parameter (QP)."""
 
@@ -175,7 +164,7 @@ class Compressor:
     @property
     def descent_iterations(self) -> int:
         """Number of iterations before rounding."""
-        return int(_SCHEDULE.descent_share * self.iterations)
+        return int(_DESCENT_SHARE * self.iterations)
 
     @property
     def rounding_iterations(self) -> int:
@@ -187,19 +176,19 @@ class Compressor:
 
         def update_qp(writer: SceneWriter, qp: int) -> int:
             size = len(writer.write_rounded(qp))
-            change = _SCHEDULE.descent_aim * target_bytes - size
-            return writer.next_qp(qp, size, size + round(_SCHEDULE.bytes_gain * change))
+            change = _DESCENT_AIM * target_bytes - size
+            return writer.next_qp(qp, size, size + round(_BYTES_GAIN * change))
 
         writer, qp = self._descend(update_qp(self.writer, self.writer.qp_for(None)), update_qp)
         qp, max_qp = self._secant(writer, qp, target_bytes), self.writer.qp_for(QUALITIES[1])
         size, candidates = target_bytes, []
-        for _ in range(_SCHEDULE.max_roundings):
-            qp = min(writer.next_qp(qp, size, round(_SCHEDULE.rounding_aim * target_bytes)), max_qp)
+        for _ in range(_MAX_ROUNDINGS):
+            qp = min(writer.next_qp(qp, size, round(_ROUNDING_AIM * target_bytes)), max_qp)
             data = self._round(writer, qp, self.rounding_iterations, target_bytes)
             size = len(data)
             if size <= target_bytes:
                 candidates.append(data)
-            if size >= _SCHEDULE.min_fill * target_bytes or qp == max_qp:
+            if size >= _MIN_FILL * target_bytes or qp == max_qp:
                 break
         if candidates:
             return max(candidates, key=len)
@@ -208,7 +197,7 @@ class Compressor:
     def _secant(self, writer: SceneWriter, qp: int, target_bytes: int) -> int:
         """Find, by the secant method, the QP at which a file has about `target_bytes` if it is rounded at once."""
         sizes: dict[int, int] = {}
-        while len(sizes) < _SCHEDULE.max_secants and qp not in sizes:
+        while len(sizes) < _MAX_SECANTS and qp not in sizes:
             sizes[qp] = len(self._round(writer, qp, 0))
             next_qp = writer.next_qp(qp, sizes[qp], target_bytes)
             if len(sizes) > 1:
@@ -245,11 +234,11 @@ class Compressor:
                 writer = writer.with_gaussians(descent.parameters(), descent.ids)
             qp = update_qp(writer, qp)
             descent.quantizer = Quantizer(qp, writer.size)
-            if descent.iteration >= _SCHEDULE.prune_from * iterations:
+            if descent.iteration >= _PRUNE_FROM * iterations:
                 descent.prune()
 
         progress = count_iterations(descent, iterations)
-        times = [k / iterations for k in range(0, iterations, _SCHEDULE.update_interval)]
+        times = [k / iterations for k in range(0, iterations, _UPDATE_INTERVAL)]
         run(descent, descent.step, progress, [End(), TimedAction(times, update)], lambda progress: RATE)
         return writer.with_gaussians(descent.parameters(), descent.ids) if iterations else writer, qp
 
