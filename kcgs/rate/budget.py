@@ -256,6 +256,9 @@ def _choose_regions(problem: Problem, target_bytes: int) -> _RegionChoice:
         return choice
     map_bytes = _map_bytes(regions)
     if not config.merge_regions:
+        if target_bytes < map_bytes + _MIN_BYTES:
+            expected = f"at least {map_bytes + _MIN_BYTES} for this map, whose regions are kept"
+            raise InvalidArgument("target_bytes", expected, target_bytes)
         return choice._replace(regions=regions, num_gaussians=num_gaussians(target_bytes - map_bytes))
     if _reduction(_min_sigma(problem, choice.num_gaussians)) > 1:
         return choice._replace(changes={"dropped": "bytes"})

@@ -13,7 +13,7 @@ from kcgs._check import check_count, check_number
 from kcgs._image import as_image
 from kcgs._objectives import check_objective, objective_for
 from kcgs._repr import brief
-from kcgs.codec import QPS, QUALITIES, Quantizer, SceneWriter, decode
+from kcgs.codec import QPS, QUALITIES, Parameters, Quantizer, SceneWriter, decode
 from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
 from kcgs.functional import psnr
@@ -75,6 +75,7 @@ def compress(
     iterations: int = 600,
     seed: int = 0,
     objective: str | None = None,
+    min_sigma: float = 0.0,
 ) -> Compressed:
     """Write a scene as a `.kcgs` file with the least error against its image.
 
@@ -92,16 +93,17 @@ def compress(
             it, none coarser than the default of `quality`. If the scene itself does not reach it, the file is nearly
             as good as the scene.
         iterations: renders that descent and rounding may take, at least 1.
-        seed: of the order in which Gaussians are rounded.
+        seed: of the order in which Gaussians are rounded, at least 0.
         objective: of the descent, l2 or ms-ssim, as in :class:`kcgs.FitConfig`. None: ms-ssim with `target_bytes`,
             else l2.
+        min_sigma: least standard deviation of a Gaussian in pixels, before it is rounded.
 
     Returns:
         The file, and the scene that it decodes to.
 
     Raises:
-        TypeError, ValueError: as :func:`kcgs.codec.encode`; an image that does not fit the scene; `iterations` below
-            1, another `objective`.
+        TypeError, ValueError: as :func:`kcgs.codec.encode`; an image that does not fit the scene; a number out of
+            range, another `objective`. All come before the descent.
 
     Example:
         >>> from kcgs import fit
@@ -121,9 +123,13 @@ def compress(
         if quality is not None or target_bytes is not None:
             raise InvalidArgument("target_psnr", "None with quality or target_bytes", target_psnr)
     qp = writer.qp_for(quality, target_bytes)
+    if target_bytes is not None:
+        _check_target_bytes(writer, target_bytes)
     check_count("iterations", iterations)
+    check_count("seed", seed, 0, 2**63 - 1)
+    check_number("min_sigma", min_sigma, 0.0, unit="pixels")
     name = objective_for("file of a PSNR" if target_bytes is None else "file of a size", check_objective(objective))
-    compressor = Compressor(writer, OBJECTIVES[name](target), iterations, seed)
+    compressor = Compressor(writer, OBJECTIVES[name](target), iterations, seed, min_sigma)
     with threads_for_kernels(target[0].numel()):
         if target_bytes is not None:
             data = compressor.search_bytes(target_bytes)
@@ -136,6 +142,14 @@ def compress(
             else:
                 data = compressor.search_psnr(target_psnr, scene_psnr)
     return Compressed(data, decode(data).scene)
+
+
+def _check_target_bytes(writer: SceneWriter, target_bytes: int) -> None:
+    """Refuse a size that the map and a single, coarse Gaussian exceed."""
+    gaussian = Parameters(*(numbers[:1] for numbers in writer.gaussians))
+    least = len(writer.with_gaussians(gaussian, writer.ids[:1]).write_rounded(QPS[0]))
+    if check_count("target_bytes", target_bytes) < least:
+        raise InvalidArgument("target_bytes", f"at least {least} for this scene", target_bytes)
 
 
 def quality_for(psnr: float) -> float:
@@ -159,7 +173,7 @@ class Compressor:
     objective: ImageObjective  # of an image of the scene's size, or smaller
     iterations: int
     seed: int
-    min_sigma: float = 0.0
+    min_sigma: float
 
     @property
     def descent_iterations(self) -> int:

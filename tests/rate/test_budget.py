@@ -138,6 +138,11 @@ class TestFitBytes:
             fit_bytes(torch.rand(3, 16, 16), None, target, **settings)
 
 
+def test_a_kept_map_that_exceeds_the_file_is_refused_before_the_fit(photo: Photo) -> None:
+    with pytest.raises(ValueError, match="target_bytes must be at least [0-9]+ for this map, whose regions are kept"):
+        fit_bytes(*speckles(photo[0]), 150, merge_regions=False, iterations=10**9)
+
+
 def test_gaussian_budget() -> None:
     counts = [BUDGETS["l2"].num_gaussians(size, 10_000) for size in (1, 100, 1000, 8000, 50_000)]
     assert counts == sorted(counts) and counts[0] == 1 and 2200 < counts[3] < 2700
