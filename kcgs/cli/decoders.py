@@ -27,6 +27,8 @@ def export(
 ) -> None:
     """Write a scene's decoder as ONNX, or the scene as one web page: neither needs torch or kcgs."""
     check_output(output, ".onnx", ".html")
+    if output.suffix == ".html":
+        exclude("a page", interactive=interactive or None)
     from kcgs import load
     from kcgs.onnx import describe_decoder, scene_decoder
 
@@ -34,7 +36,6 @@ def export(
     if output.suffix == ".html":
         from kcgs.page import scene_page, web_bytes
 
-        exclude("a page", interactive=interactive or None)
         # a compressed file goes into the page unchanged
         data = web_bytes(scene.read_bytes() if scene.suffix == ".kcgs" else loaded)
         size = write_file(output, scene_page(data, title=output.stem))

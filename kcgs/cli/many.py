@@ -111,7 +111,6 @@ def fit_many_command(
     single = takes_one_image(request)
     if single is not None and batch not in ("auto", "1"):
         options.exclude(f"--{single}", batch=batch)
-    output.mkdir(parents=True, exist_ok=True)
     devices = _list_devices(request) if engine == "local" else [request.device]
     on_gpu = devices[0].startswith("cuda")
     if workers is None and engine == "local":
@@ -121,6 +120,7 @@ def fit_many_command(
     workers = None if workers is None else min(workers, len(batches))
     shards = Shards([batch.work for batch in batches])
     shards.check()
+    output.mkdir(parents=True, exist_ok=True)
     outcomes = dict[int, Outcome]()
     try:
         with Progress("fit-many", visible=not quiet) as progress:
@@ -141,9 +141,14 @@ def fit_many_command(
         rows = [{"image": str(jobs[index].image), **outcomes[index].row} for index in sorted(outcomes)]
         if any("error" not in row for row in rows):  # if all images failed, an older table stays
             _write_table(output / "results.csv", rows)
+    num_kept = sum(not outcome.is_new and "error" not in outcome.row for outcome in outcomes.values())
+    _report_rows(rows, num_kept, output, as_json)
+
+
+def _report_rows(rows: list[dict[str, Any]], num_kept: int, output: Path, as_json: bool) -> None:
+    """Print how many images were fitted, and which failed or missed their target; with any, exit status 1."""
     failures = [row for row in rows if "error" in row]
     misses = [row for row in rows if row.get("target_reached") is False]
-    num_kept = sum(not outcome.is_new and "error" not in outcome.row for outcome in outcomes.values())
     counts = {
         "images": len(rows), "fitted": len(rows) - len(failures) - num_kept, "kept": num_kept,
         "failed": len(failures), "missed": len(misses),
@@ -194,12 +199,11 @@ def _by_stem(name: str, files: Iterable[Path]) -> dict[str, Path]:
 
 
 def _list_devices(request: options.FitRequest) -> list[str]:
-    """Return the devices of the option --device: "cuda" means all GPUs of the machine."""
-    if request.device != "cuda":
-        return [request.device]
+    """Return the devices of the option --device: "cuda" means all GPUs of the machine; refuse a device that is none."""
     import torch
 
-    return [f"cuda:{number}" for number in range(torch.cuda.device_count())] or [request.device]
+    count = torch.cuda.device_count() if request.device == "cuda" else 0
+    return [f"cuda:{number}" for number in range(count)] or [str(request.load_device())]
 
 
 def _count_cores() -> int:

@@ -127,8 +127,8 @@ def fit_jobs(jobs: Sequence[FitJob]) -> list[Outcome]:
     for index, job in enumerate(jobs):
         try:
             fingerprint = _fingerprint(job)
-            if (kept := _read_unchanged(job, fingerprint)) is not None:
-                outcomes[index] = Outcome(kept, False)
+            if (row := _existing_row(job, fingerprint)) is not None:
+                outcomes[index] = Outcome(row, False)
                 continue
             loaded = load_job(job)
             # if the command is killed between scene and row, the next run recognizes the scene as its own
@@ -151,12 +151,12 @@ def _fit_group(jobs: Sequence[FitJob], group: dict[int, tuple[Loaded, str]]) -> 
         except Exception:  # one by one, the image at fault gives its own error
             fits = {}
     return {
-        index: _fit_and_save(jobs[index], loaded, fingerprint, fits.get(index))
+        index: _finish_job(jobs[index], loaded, fingerprint, fits.get(index))
         for index, (loaded, fingerprint) in group.items()
     }
 
 
-def _fit_and_save(job: FitJob, loaded: Loaded, fingerprint: str, fit: BatchFit | None) -> Outcome:
+def _finish_job(job: FitJob, loaded: Loaded, fingerprint: str, fit: BatchFit | None) -> Outcome:
     """Write the scene and the row of an image; fit the image first if `fit` is None."""
     try:
         with warnings.catch_warnings(record=True) as messages:
@@ -169,8 +169,8 @@ def _fit_and_save(job: FitJob, loaded: Loaded, fingerprint: str, fit: BatchFit |
             report = report_fit(saved_fit, loaded.image, loaded.labels, job.output, job.request)
         row = {**replace_undefined(report), "fingerprint": fingerprint}
         write_file(job.output.with_suffix(".json"), json.dumps({**row, "checksum": _checksum(job.output, row)}))
-        said = () if fit is None else fit.warnings
-        return Outcome(row, True, (*loaded.warnings, *said, *(str(message.message) for message in messages)))
+        fit_warnings = () if fit is None else fit.warnings
+        return Outcome(row, True, (*loaded.warnings, *fit_warnings, *(str(message.message) for message in messages)))
     except Exception as error:
         return _failure(error)
 
@@ -181,24 +181,24 @@ def _failure(error: Exception) -> Outcome:
 
 def _is_done(job: FitJob) -> bool:
     try:
-        return _read_kept(job, _fingerprint(job)) is not None
+        return _valid_row(job, _fingerprint(job)) is not None
     except OSError:
         return False
 
 
-def _read_unchanged(job: FitJob, fingerprint: str) -> dict[str, Any] | None:
+def _existing_row(job: FitJob, fingerprint: str) -> dict[str, Any] | None:
     """Return the row of an existing, unchanged scene, else None; without --overwrite, refuse to replace another."""
     if not job.output.is_file():
         return None
-    kept = _read_kept(job, fingerprint)
+    row = _valid_row(job, fingerprint)
     is_unfinished = _read_row(job.output.with_suffix(".json")) == {"fingerprint": fingerprint}
-    if kept is None and not (is_unfinished or job.overwrite):
+    if row is None and not (is_unfinished or job.overwrite):
         problem = "made with other settings or changed since"
         raise FileExistsError(f"{job.output} exists, {problem}; --overwrite replaces it")
-    return kept
+    return row
 
 
-def _read_kept(job: FitJob, fingerprint: str) -> dict[str, Any] | None:
+def _valid_row(job: FitJob, fingerprint: str) -> dict[str, Any] | None:
     """Return the row beside a scene if its fingerprint and checksum are right, else None."""
     row = _read_row(job.output.with_suffix(".json"))
     checksum = row.pop("checksum", None)

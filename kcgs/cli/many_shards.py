@@ -40,8 +40,11 @@ class ShardPart(NamedTuple):
 
     def run(self) -> list[Outcome]:
         """Fit the images and write their scenes, unless these are in the shard or in the part's file."""
-        kept = _read_kept(self, self.shard, self.fingerprint) or _read_kept(self, self.path, self.own_fingerprint)
-        return kept or _fit_part(self)
+        return (
+            _read_outcomes(self, self.shard, self.fingerprint)
+            or _read_outcomes(self, self.path, self.own_fingerprint)
+            or _fit_part(self)
+        )
 
     def count_done(self) -> int:
         """Count the images whose scenes are on disk."""
@@ -78,9 +81,12 @@ class Shards:
 
 
 def fingerprint_of(jobs: Sequence[FitJob]) -> str:
-    """Hash the settings, and the names and sizes of images and masks, but not their contents: there may be millions."""
+    """Hash the settings, and the names and sizes of images and masks, but not their contents: there may be millions.
+
+    A mask of another size is an error of its image, which a shard keeps; so with --resize-regions a shard is another.
+    """
     files = [(job.image.name, _bytes(job.image), _bytes(Path(job.regions)) or job.regions) for job in jobs]
-    return _hash((describe_settings(jobs[0]), files))
+    return _hash((describe_settings(jobs[0]), files, *(["resized"] if jobs[0].resize_regions else [])))
 
 
 def _hash(value: object) -> str:
@@ -105,11 +111,11 @@ def _fit_part(part: ShardPart) -> list[Outcome]:
         except Exception as error:
             outcomes[index] = Outcome({"error": describe_error(error)}, True)
     if loaded:
-        outcomes |= _fit_and_save(part, loaded, {index: outcome.row["error"] for index, outcome in outcomes.items()})
+        outcomes |= _fit_loaded(part, loaded, {index: outcome.row["error"] for index, outcome in outcomes.items()})
     return [outcomes[index] for index in range(len(part.images))]
 
 
-def _fit_and_save(part: ShardPart, loaded: dict[int, Loaded], errors: dict[int, str]) -> dict[int, Outcome]:
+def _fit_loaded(part: ShardPart, loaded: dict[int, Loaded], errors: dict[int, str]) -> dict[int, Outcome]:
     """Fit images of the same shape, and write the part."""
     from kcgs.data import save_shard, stack_scenes
     from kcgs.fitting import rank_gaussians
@@ -129,10 +135,9 @@ def _fit_and_save(part: ShardPart, loaded: dict[int, Loaded], errors: dict[int, 
     names = [part.images[index].image.name for index in loaded]
     psnr = [float(fit.result.psnr) for fit in fits]
     rows = [
-        {"psnr": float(fit.result.psnr), "num_gaussians": fit.result.scene.num_gaussians, "seconds": fit.seconds}
-        for fit in fits
+        replace_undefined({"psnr": number, "num_gaussians": scene.num_gaussians, "seconds": fit.seconds})
+        for number, scene, fit in zip(psnr, singles, fits, strict=True)
     ]
-    rows = [replace_undefined(row) for row in rows]
     failed = {part.images[index].image.name: error for index, error in errors.items()}
     notes = {"fingerprint": part.own_fingerprint, "rows": json.dumps(rows), "errors": json.dumps(failed)}
     part.path.parent.mkdir(exist_ok=True)
@@ -143,7 +148,7 @@ def _fit_and_save(part: ShardPart, loaded: dict[int, Loaded], errors: dict[int, 
     }
 
 
-def _read_kept(part: ShardPart, path: Path, fingerprint: str) -> list[Outcome] | None:
+def _read_outcomes(part: ShardPart, path: Path, fingerprint: str) -> list[Outcome] | None:
     """Return the rows of a part from a file of the same images and settings; None: there is no such file."""
     notes = _notes(path)
     if notes.get("fingerprint") != fingerprint:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from kcgs._objectives import objective_for
 from kcgs._suffixes import VIDEOS, WRITTEN_IMAGES
 
 from . import options
@@ -60,6 +61,8 @@ def fit_video_command(
     if output.suffix:  # none: a folder
         check_output(output, ".safetensors")
     check_new(output, overwrite)
+    config = request.load_config()
+    objective_for("video", config.objective)  # refuses another objective before the work
     from kcgs.data import load_labels
     from kcgs.functional import psnr
     from kcgs.video import fit_video, read_label_maps, read_video
@@ -76,7 +79,7 @@ def fit_video_command(
     start = time.perf_counter()
     with InterruptHandler() as interrupts:
         scenes = fit_video(
-            source, maps, request.num_gaussians, recipe=request.load_config(), seed=request.seed, progress=not quiet,
+            source, maps, request.num_gaussians, recipe=config, seed=request.seed, progress=not quiet,
             on_frame=interrupts.on_step,
         )  # fmt: skip
         seconds = time.perf_counter() - start

@@ -40,15 +40,15 @@ class GaussianBudget:
     tuned. To tune one again, change it and compare the files of ``python -m benchmarks rate``: all have the same size.
     """
 
-    bits_per_gaussian: float = 25.2
+    bits_per_gaussian: float = 27.1
     """Bits of the file per Gaussian of the fit, at `reference_count`. More: fewer Gaussians, each rounded less."""
-    reference_count: int = 2100
-    """Number of Gaussians for which `bits_per_gaussian` holds: a file of 6,700 bytes."""
+    reference_count: int = 4200
+    """Number of Gaussians for which `bits_per_gaussian` holds: a file of 14,300 bytes."""
     bits_per_doubling: float = 1.9
-    """Increase of the bits per Gaussian for each doubling of the number of Gaussians. More: small files get more
-    Gaussians, large files fewer."""
+    """Increase of the bits per Gaussian for each doubling of the number of Gaussians, down to `min_bits_per_gaussian`.
+    More: large files get fewer Gaussians."""
     min_bits_per_gaussian: float = 26.0
-    """Least bits per Gaussian; with the other defaults they hold for up to 2,800 Gaussians."""
+    """Bits per Gaussian of small files, of at most 2,800 Gaussians. More: fewer Gaussians, each rounded less."""
     header_bytes: int = 30
     """Bytes of a file besides Gaussians and map."""
     least_spacing: float = math.inf
@@ -78,41 +78,34 @@ class GaussianBudget:
         return self.width_per_spacing * max(0.0, math.sqrt(pixels / num_gaussians) - self.least_spacing)
 
 
-@dataclass(frozen=True)
-class FitBytesSettings:
-    """Trade-offs of a fit to a size of a file: time against error, and contours against Gaussians.
-
-    All fields are tuned. To tune one again, change it and compare the files of ``python -m benchmarks rate``.
-    """
-
-    fit_share: float = 0.845
-    """Share of a fit's schedule that is run; the descent of `compress` replaces the rest. More: slower."""
-    fit_share_with_regions: float = 0.89
-    """The same share with a label map; at least 0.88, where contours move for the last time."""
-    trial_iterations: int = 80
-    """Iterations of a trial fit. More: slower, and its error predicts that of the whole fit better."""
-    final_error_share: float = 0.65
-    """Squared error after the whole fit, as a share of the error after a trial. More: contours must save more error."""
-    rate_exponent: float = 0.93
-    """e in "squared error ~ bytes^-e", the slope of the rate-distortion curve. More: contours must save more error."""
-    reduced_share: float = 0.7
-    """Share of all iterations that the few Gaussians of a reduced photo take. More: slower."""
-    pixels_per_sigma: float = 1.5
-    """Least standard deviation of the Gaussians on a reduced photo, in its pixels. More: slower, and finer details."""
-
-
 # rounding lowers MS-SSIM more than fewer Gaussians do; the least width avoids visible stray strokes
 BUDGETS: dict[ObjectiveName, GaussianBudget] = {
     "l2": GaussianBudget(),
     "ms-ssim": GaussianBudget(
-        bits_per_gaussian=28.5,
+        bits_per_gaussian=30.4,
         min_bits_per_gaussian=29.0,
         least_spacing=8.0,
         fit_iterations=500,
         compress_iterations=400,
     ),
 }
-_SETTINGS = FitBytesSettings()
+
+# These numbers are tuned: change one and compare the files of `python -m benchmarks rate`, which have the same size.
+
+# share of a fit's schedule that is run; the descent of `compress` replaces the rest. More: slower
+_FIT_SHARE = 0.845
+# the same share with a label map; at least 0.88, where contours move for the last time
+_FIT_SHARE_WITH_REGIONS = 0.89
+# iterations of a trial fit. More: slower, and its error predicts that of the whole fit better
+_TRIAL_ITERATIONS = 80
+# squared error after the whole fit, as a share of the error after a trial. More: contours must save more error
+_FINAL_ERROR_SHARE = 0.65
+# e in "squared error ~ bytes^-e", the slope of the rate-distortion curve. More: contours must save more error
+_RATE_EXPONENT = 0.93
+# share of all iterations that the few Gaussians of a reduced photo take. More: slower
+_REDUCED_SHARE = 0.7
+# least standard deviation of the Gaussians on a reduced photo, in its pixels. More: slower, and finer details
+_PIXELS_PER_SIGMA = 1.5
 
 
 @brief
@@ -195,7 +188,7 @@ def fit_bytes(
     with Progress("trial fits", pulse=True, visible=progress), threads_for_kernels(problem.target[0, 0].numel()):
         choice = _choose_regions(problem, target_bytes)
     reduced = _reduce(problem, choice)
-    share = _SETTINGS.fit_share if choice.regions is None else _SETTINGS.fit_share_with_regions
+    share = _FIT_SHARE if choice.regions is None else _FIT_SHARE_WITH_REGIONS
     result = _fit_share(share, reduced, on_step, progress)
     scene = _enlarge(result.scene, problem.size)
     report = None if problem.regions is None else report_regions(problem.regions, scene, **choice.changes)
@@ -236,11 +229,11 @@ def _min_sigma(problem: Problem, num_gaussians: int) -> float:
 
 def _reduction(min_sigma: float) -> int:
     """Return the factor by which a photo may be reduced if no Gaussian is thinner than `min_sigma`."""
-    return max(1, int(min_sigma / _SETTINGS.pixels_per_sigma))
+    return max(1, int(min_sigma / _PIXELS_PER_SIGMA))
 
 
 def _shorten(iterations: int, reduction: int) -> int:
-    return iterations if reduction == 1 else round(_SETTINGS.reduced_share * iterations)
+    return iterations if reduction == 1 else round(_REDUCED_SHARE * iterations)
 
 
 def _enlarge(scene: Scene, size: tuple[int, int]) -> Scene:
@@ -263,23 +256,26 @@ def _choose_regions(problem: Problem, target_bytes: int) -> _RegionChoice:
         return choice
     map_bytes = _map_bytes(regions)
     if not config.merge_regions:
+        if target_bytes < map_bytes + _MIN_BYTES:
+            expected = f"at least {map_bytes + _MIN_BYTES} for this map, whose regions are kept"
+            raise InvalidArgument("target_bytes", expected, target_bytes)
         return choice._replace(regions=regions, num_gaussians=num_gaussians(target_bytes - map_bytes))
     if _reduction(_min_sigma(problem, choice.num_gaussians)) > 1:
         return choice._replace(changes={"dropped": "bytes"})
     # trials are limited by iterations, not by time, so that the same arguments give the same file
-    iterations = min(_SETTINGS.trial_iterations, config.planned_iterations)
+    iterations = min(_TRIAL_ITERATIONS, config.planned_iterations)
     trial_config = FitConfig.from_recipe(
         config, merge_regions=False, iterations=iterations, max_seconds=None, objective="l2"
     )
     trial = replace(problem, config=trial_config)
 
     def trial_error(regions: RegionMap | None, count: int) -> Tensor:
-        scene = _fit_share(_SETTINGS.fit_share, replace(trial, regions=regions, num_gaussians=count)).scene
+        scene = _fit_share(_FIT_SHARE, replace(trial, regions=regions, num_gaussians=count)).scene
         return (scene.render() - image).square().mean(0)
 
     plain_error = trial_error(None, choice.num_gaussians)
     # squared error, summed over pixels, that one more bit of Gaussians saves: the derivative of the power law
-    bit_value = _SETTINGS.rate_exponent * _SETTINGS.final_error_share * float(plain_error.sum()) / (8 * target_bytes)
+    bit_value = _RATE_EXPONENT * _FINAL_ERROR_SHARE * float(plain_error.sum()) / (8 * target_bytes)
     contour_cost = bit_value * (8 * map_bytes / max(len(contour_edges(regions.labels)[0]), 1))
     paying_regions = regions
     if regions.softness == 0.0:

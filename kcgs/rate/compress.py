@@ -13,7 +13,7 @@ from kcgs._check import check_count, check_number
 from kcgs._image import as_image
 from kcgs._objectives import check_objective, objective_for
 from kcgs._repr import brief
-from kcgs.codec import QPS, QUALITIES, Quantizer, SceneWriter, decode
+from kcgs.codec import QPS, QUALITIES, Parameters, Quantizer, SceneWriter, decode
 from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
 from kcgs.functional import psnr
@@ -28,6 +28,31 @@ from .rounding import round_gradually
 _QUALITY_MARGIN = 14.5
 # dB that are added to the quality until a file reaches `target_psnr`
 _QUALITY_STEPS = (0.0, 2.0, 5.0, 9.0, 14.0, 20.0, 30.0, 50.0)
+
+# These numbers are tuned: change one and compare the files of `python -m benchmarks rate`, which have the same size.
+
+# share of the iterations before rounding starts; in the others the descent goes on while Gaussians are rounded. More:
+# Gaussians are cheaper, and their neighbours correct less of the rounding errors
+_DESCENT_SHARE = 0.7
+# iterations between two updates of the QP, each of which writes a file. More: faster, and farther from the target
+_UPDATE_INTERVAL = 70
+# share of the descent after which Gaussians are pruned that save less error than their bits cost. More: they have more
+# time to become useful, and the others have less time to replace them
+_PRUNE_FROM = 0.8
+# size that the descent aims at, as a share of `target_bytes`: gradual rounding saves 0.6 %
+_DESCENT_AIM = 1.006
+# size that rounding aims at, as a share of `target_bytes`; excess Gaussians are removed on the way. More: more
+# Gaussians are removed. Less: more files are too small and are rounded again
+_ROUNDING_AIM = 1.01
+# share of `target_bytes` that is large enough. More: slower, and less error
+_MIN_FILL = 0.995
+# largest number of roundings of a scene until a file has `_MIN_FILL`
+_MAX_ROUNDINGS = 3
+# largest number of files that are written to find the QP of the first rounding
+_MAX_SECANTS = 4
+# factor on the change of size that an update of the QP aims at: numbers that round to 0 take no more bits when their
+# steps become finer. More: the size oscillates. Less: it lags behind
+_BYTES_GAIN = 1.3
 
 
 @brief
@@ -50,6 +75,7 @@ def compress(
     iterations: int = 600,
     seed: int = 0,
     objective: str | None = None,
+    min_sigma: float = 0.0,
 ) -> Compressed:
     """Write a scene as a `.kcgs` file with the least error against its image.
 
@@ -67,16 +93,17 @@ def compress(
             it, none coarser than the default of `quality`. If the scene itself does not reach it, the file is nearly
             as good as the scene.
         iterations: renders that descent and rounding may take, at least 1.
-        seed: of the order in which Gaussians are rounded.
+        seed: of the order in which Gaussians are rounded, at least 0.
         objective: of the descent, l2 or ms-ssim, as in :class:`kcgs.FitConfig`. None: ms-ssim with `target_bytes`,
             else l2.
+        min_sigma: least standard deviation of a Gaussian in pixels, before it is rounded.
 
     Returns:
         The file, and the scene that it decodes to.
 
     Raises:
-        TypeError, ValueError: as :func:`kcgs.codec.encode`; an image that does not fit the scene; `iterations` below
-            1, another `objective`.
+        TypeError, ValueError: as :func:`kcgs.codec.encode`; an image that does not fit the scene; a number out of
+            range, another `objective`. All come before the descent.
 
     Example:
         >>> from kcgs import fit
@@ -96,9 +123,13 @@ def compress(
         if quality is not None or target_bytes is not None:
             raise InvalidArgument("target_psnr", "None with quality or target_bytes", target_psnr)
     qp = writer.qp_for(quality, target_bytes)
+    if target_bytes is not None:
+        _check_target_bytes(writer, target_bytes)
     check_count("iterations", iterations)
+    check_count("seed", seed, 0, 2**63 - 1)
+    check_number("min_sigma", min_sigma, 0.0, unit="pixels")
     name = objective_for("file of a PSNR" if target_bytes is None else "file of a size", check_objective(objective))
-    compressor = Compressor(writer, OBJECTIVES[name](target), iterations, seed)
+    compressor = Compressor(writer, OBJECTIVES[name](target), iterations, seed, min_sigma)
     with threads_for_kernels(target[0].numel()):
         if target_bytes is not None:
             data = compressor.search_bytes(target_bytes)
@@ -111,6 +142,14 @@ def compress(
             else:
                 data = compressor.search_psnr(target_psnr, scene_psnr)
     return Compressed(data, decode(data).scene)
+
+
+def _check_target_bytes(writer: SceneWriter, target_bytes: int) -> None:
+    """Refuse a size that the map and a single, coarse Gaussian exceed."""
+    gaussian = Parameters(*(numbers[:1] for numbers in writer.gaussians))
+    least = len(writer.with_gaussians(gaussian, writer.ids[:1]).write_rounded(QPS[0]))
+    if check_count("target_bytes", target_bytes) < least:
+        raise InvalidArgument("target_bytes", f"at least {least} for this scene", target_bytes)
 
 
 def quality_for(psnr: float) -> float:
@@ -127,42 +166,6 @@ def quality_for(psnr: float) -> float:
 
 
 @dataclass(frozen=True)
-class CompressionSchedule:
-    """The division of the iterations into phases, and the sizes that each phase aims at for `target_bytes`.
-
-    All fields are tuned. To tune one again, change it and compare the files of ``python -m benchmarks rate``: all have
-    the same size.
-    """
-
-    descent_share: float = 0.7
-    """Share of the iterations before rounding starts; in the others the descent goes on while Gaussians are rounded.
-    More: Gaussians are cheaper, and their neighbours correct less of the rounding errors."""
-    update_interval: int = 70
-    """Iterations between two updates of the QP, each of which writes a file. More: faster, and farther from the
-    target."""
-    prune_from: float = 0.8
-    """Share of the descent after which Gaussians are pruned that save less error than their bits cost. More: they have
-    more time to become useful, and the others have less time to replace them."""
-    descent_aim: float = 1.006
-    """Size that the descent aims at, as a share of `target_bytes`: gradual rounding saves 0.6 %."""
-    rounding_aim: float = 1.01
-    """Size that rounding aims at, as a share of `target_bytes`; excess Gaussians are removed on the way. More: more
-    Gaussians are removed. Less: more files are too small and are rounded again."""
-    min_fill: float = 0.995
-    """Share of `target_bytes` that is large enough. More: slower, and less error."""
-    max_roundings: int = 3
-    """Largest number of roundings of a scene until a file has `min_fill`."""
-    max_secants: int = 4
-    """Largest number of files that are written to find the QP of the first rounding."""
-    bytes_gain: float = 1.3
-    """Factor on the change of size that an update of the QP aims at: numbers that round to 0 take no more bits when
-    their steps become finer. More: the size oscillates. Less: it lags behind."""
-
-
-_SCHEDULE = CompressionSchedule()
-
-
-@dataclass(frozen=True)
 class Compressor:
     """Rate-distortion descent and gradual rounding of one scene, at any quantization parameter (QP)."""
 
@@ -170,12 +173,12 @@ class Compressor:
     objective: ImageObjective  # of an image of the scene's size, or smaller
     iterations: int
     seed: int
-    min_sigma: float = 0.0
+    min_sigma: float
 
     @property
     def descent_iterations(self) -> int:
         """Number of iterations before rounding."""
-        return int(_SCHEDULE.descent_share * self.iterations)
+        return int(_DESCENT_SHARE * self.iterations)
 
     @property
     def rounding_iterations(self) -> int:
@@ -187,19 +190,19 @@ class Compressor:
 
         def update_qp(writer: SceneWriter, qp: int) -> int:
             size = len(writer.write_rounded(qp))
-            change = _SCHEDULE.descent_aim * target_bytes - size
-            return writer.next_qp(qp, size, size + round(_SCHEDULE.bytes_gain * change))
+            change = _DESCENT_AIM * target_bytes - size
+            return writer.next_qp(qp, size, size + round(_BYTES_GAIN * change))
 
         writer, qp = self._descend(update_qp(self.writer, self.writer.qp_for(None)), update_qp)
         qp, max_qp = self._secant(writer, qp, target_bytes), self.writer.qp_for(QUALITIES[1])
         size, candidates = target_bytes, []
-        for _ in range(_SCHEDULE.max_roundings):
-            qp = min(writer.next_qp(qp, size, round(_SCHEDULE.rounding_aim * target_bytes)), max_qp)
+        for _ in range(_MAX_ROUNDINGS):
+            qp = min(writer.next_qp(qp, size, round(_ROUNDING_AIM * target_bytes)), max_qp)
             data = self._round(writer, qp, self.rounding_iterations, target_bytes)
             size = len(data)
             if size <= target_bytes:
                 candidates.append(data)
-            if size >= _SCHEDULE.min_fill * target_bytes or qp == max_qp:
+            if size >= _MIN_FILL * target_bytes or qp == max_qp:
                 break
         if candidates:
             return max(candidates, key=len)
@@ -208,7 +211,7 @@ class Compressor:
     def _secant(self, writer: SceneWriter, qp: int, target_bytes: int) -> int:
         """Find, by the secant method, the QP at which a file has about `target_bytes` if it is rounded at once."""
         sizes: dict[int, int] = {}
-        while len(sizes) < _SCHEDULE.max_secants and qp not in sizes:
+        while len(sizes) < _MAX_SECANTS and qp not in sizes:
             sizes[qp] = len(self._round(writer, qp, 0))
             next_qp = writer.next_qp(qp, sizes[qp], target_bytes)
             if len(sizes) > 1:
@@ -245,11 +248,11 @@ class Compressor:
                 writer = writer.with_gaussians(descent.parameters(), descent.ids)
             qp = update_qp(writer, qp)
             descent.quantizer = Quantizer(qp, writer.size)
-            if descent.iteration >= _SCHEDULE.prune_from * iterations:
+            if descent.iteration >= _PRUNE_FROM * iterations:
                 descent.prune()
 
         progress = count_iterations(descent, iterations)
-        times = [k / iterations for k in range(0, iterations, _SCHEDULE.update_interval)]
+        times = [k / iterations for k in range(0, iterations, _UPDATE_INTERVAL)]
         run(descent, descent.step, progress, [End(), TimedAction(times, update)], lambda progress: RATE)
         return writer.with_gaussians(descent.parameters(), descent.ids) if iterations else writer, qp
 

@@ -20,6 +20,7 @@ from kcgs.data import load_image, load_labels, save_image, save_labels
 from kcgs.functional import METRICS, psnr
 from kcgs.segment import segment
 from tests.cli.conftest import Kcgs
+from tests.rate.conftest import min_sigma
 
 KEYS = METRICS.keys() - {"ssimulacra2"} | {"num_gaussians", "regions", "seconds", "bytes", "bits_per_pixel"}
 FIT = ("fit", "photo.png", "-n", "12", "--iterations", "20", "-o", "scene.safetensors")
@@ -133,6 +134,20 @@ class TestFit:
         assert code == 2 and "must be l2 or ms-ssim for a file of a PSNR; got 'l1'" in err
         assert kcgs(*FIT[:-1], "photo.kcgs", "--recipe", "paper", "--objective", "l2").code == 0
 
+    def test_settings_that_a_file_does_not_take(self, kcgs: Kcgs) -> None:
+        """They are refused before the image is read."""
+        Path("photo.png").write_text("this is no image")
+        for purpose, options in (("PSNR", ()), ("size", ("--target-bytes", 900))):
+            for setting, words in (("--objective=l1", "l2"), ("--bounded", f"must be False for a file of a {purpose}")):
+                code, _, err = kcgs("fit", "photo.png", "-o", "photo.kcgs", *options, setting)
+                assert code == 2 and words in err, err
+        assert "'--device': must be one that torch has" in kcgs("fit", "photo.png", "--device", "tpu").err
+
+    def test_least_width_of_a_file(self, kcgs: Kcgs) -> None:
+        """A file keeps the least width, but for its rounding."""
+        assert kcgs(*FIT[:-1], "photo.kcgs", "--regions", "none", "--min-sigma", "2").code == 0
+        assert min_sigma(load("photo.kcgs")) > 1.5
+
     def test_interrupt_saves_the_best_so_far(self, kcgs: Kcgs, monkeypatch: pytest.MonkeyPatch) -> None:
         def interrupt_third_step(handler: InterruptHandler, iteration: int, entry: Any) -> bool:
             if iteration == 3:
@@ -217,7 +232,6 @@ class TestFailures:
             (("fit", "photo.png", "--target-psnr", "-3"), 2, "'--target-psnr': must be greater than 0; got -3.0"),
             (("fit", "photo.png", "-n", "5", "--target-bytes", "90"), 2, "must be left out with --target-bytes; got 5"),
             (("fit", "photo.png", "--target-bytes", "90", "-o", "a.safetensors"), 2, "must end in .kcgs"),
-            (("fit", "photo.png", "--regions", "none", "--device", "tpu"), 2, "'--device': must be one that torch has"),
             (("fit", "folder"), 2, "'IMAGE': file 'folder' is a directory"),
             (("info", "text.png"), 2, "'SCENE': must end in .safetensors or .kcgs, or be zoo:NAME; got 'text.png'"),
             (("info", "zoo:nothing"), 2, "zoo entry must be one of"),

@@ -202,6 +202,8 @@ class TestFailures:
             (("photos", "--regions", "masks"), 2, "'--regions': must have different stems; got"),
             (("photos", "--regions", "mask"), 2, "mask"),
             (("photos", "--recipe", "worst"), 2, "'--recipe': must be one of"),
+            (("photos", "--device", "tpu"), 2, "'--device': must be one that torch has"),
+            (("photos", "--bounded", "--target-bytes", "90"), 2, "'--bounded': must be False for a file of a size"),
             (("photos", "--engine", "slurm"), 2, "slurm"),
             (("empty",), 2, "must hold images"),
             (("nowhere",), 2, "kcgs: No such file or directory: nowhere"),
@@ -365,6 +367,13 @@ class TestShards:
         assert dataset.names == ["a.png", "b.png", "c.png", "tall.png"]
         assert [dataset[k].size for k in range(4)] == [(24, 36)] * 3 + [(30, 20)]
         assert dataset[0].regions is not None
+
+    def test_errors_of_masks_are_not_kept_with_resize_regions(self, fit_many: Kcgs) -> None:
+        save_labels("masks/b.png", torch.zeros(4, 4, dtype=torch.long))
+        arguments = ("photos/a.png", "photos/b.png", *FIT, "--regions", "masks", "--shard", "2", "--batch", "1")
+        assert "b.png: regions must be one map of the image's size" in fit_many(*arguments).err
+        assert "--overwrite replaces such shards" in fit_many(*arguments, "--resize-regions").err
+        assert fit_many(*arguments, "--resize-regions", "--overwrite").code == 0
 
     def test_options_without_meaning(self, fit_many: Kcgs) -> None:
         code, _, err = fit_many("photos", "-o", "out", "--shard", "9", "--suffix", ".kcgs")

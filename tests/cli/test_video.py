@@ -79,6 +79,7 @@ class TestFitVideo:
             (("-o", "a.kcgs"), 2, "must end in .safetensors"),
             (("--regions", "nothing.png"), 2, "nothing.png"),
             (("--max-seconds", "3"), 2, "No such option"),
+            (("--objective", "l1", "--regions", "nothing.png"), 2, "'--objective': must be l2 or ms-ssim for a video"),
         ],
     )
     def test_wrong_usage(self, kcgs: Kcgs, arguments: tuple[str, ...], code: int, words: str) -> None:

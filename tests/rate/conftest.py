@@ -17,6 +17,13 @@ def psnr(scene: Scene, image: Tensor) -> float:
     return -10 * math.log10(float((scene.render() - image).square().mean()))
 
 
+def min_sigma(scene: Scene) -> float:
+    """Return the least standard deviation of a scene's Gaussians, in pixels."""
+    l11, l21, l22 = scene.field.cholesky.detach().unbind(-1)
+    factors = torch.stack([torch.stack([l11, torch.zeros_like(l11)], -1), torch.stack([l21, l22], -1)], -2)
+    return float(torch.linalg.svdvals(factors).min())
+
+
 @pytest.fixture(scope="package")
 def photo(astronaut: Tensor) -> Photo:
     """A crop with two regions that its contour separates: face and background."""

@@ -16,7 +16,7 @@ from kcgs.optim.ms_ssim import MsSsim
 from kcgs.rate import compress, quality_for
 from kcgs.rate.bits import soft_bits
 
-from .conftest import Photo, psnr
+from .conftest import Photo, min_sigma, psnr
 
 
 class TestCompress:
@@ -48,6 +48,10 @@ class TestCompress:
         ]
         error = MsSsim(photo[0])
         assert error.value(images[1]) < 0.95 * error.value(images[0])
+
+    def test_least_width(self, photo: Photo, scene: Scene) -> None:
+        """The descent keeps to the least width, which rounding changes a little."""
+        assert min_sigma(compress(scene, photo[0], quality=40, iterations=30, min_sigma=2.0).scene) > 1.5
 
     def test_array(self, photo: Photo, scene: Scene) -> None:
         """An array is an image, and gives the same bytes."""
@@ -87,7 +91,10 @@ class TestCompress:
             ({"iterations": 0}, "iterations must be at least 1; got 0"),
             ({"quality": 40, "target_bytes": 900}, "quality must be None with target_bytes; got 40"),
             ({"quality": 40, "target_psnr": 30.0}, "target_psnr must be None with quality or target_bytes; got 30"),
-            ({"target_bytes": 40, "iterations": 1}, "target_bytes must be at least [0-9]+ for this scene; got 40"),
+            ({"target_bytes": 40, "iterations": 10**9}, "target_bytes must be at least [0-9]+ for this scene; got 40"),
+            ({"target_bytes": 0, "iterations": 10**9}, "target_bytes must be at least 1; got 0"),
+            ({"seed": -1}, "seed must be in .*; got -1"),
+            ({"min_sigma": -1.0}, "min_sigma must be finite and at least 0 pixels; got -1.0"),
         ],
     )
     def test_exceptions(self, photo: Photo, scene: Scene, changes: dict[str, Any], match: str) -> None:
