@@ -23,6 +23,7 @@ def save(
     target_psnr: float | None = None,
     objective: str | None = None,
     seed: int | None = None,
+    min_sigma: float | None = None,
 ) -> int:
     """Write a scene to a file, atomically; the same arguments give the same bytes.
 
@@ -40,6 +41,7 @@ def save(
         target_psnr: PSNR in dB against the image, in place of both.
         objective: l2 or ms-ssim, lowered if there is an image. None: ms-ssim with `target_bytes`, else l2.
         seed: of the order in which Gaussians are rounded, with an image. None: 0.
+        min_sigma: least standard deviation of a Gaussian in pixels, before it is rounded, with an image. None: 0.
 
     Returns:
         Size of the file in bytes.
@@ -63,7 +65,9 @@ def save(
     """
     path, scene = _check_suffix(Path(path)), check_type(scene)
     goal: dict[str, Any] = {"quality": quality, "target_bytes": target_bytes}
-    refinement: dict[str, Any] = {"target_psnr": target_psnr, "objective": objective, "seed": seed}
+    refinement: dict[str, Any] = {
+        "target_psnr": target_psnr, "objective": objective, "seed": seed, "min_sigma": min_sigma
+    }  # fmt: skip
     if path.suffix == ".safetensors":
         _check_none({"image": image, **goal, **refinement}, "for a .safetensors file, which keeps every bit")
         return write_file(path, storage.serialize(scene))
@@ -72,7 +76,8 @@ def save(
         return write_file(path, encode(scene, **goal))
     from kcgs.rate import compress  # which loads all of fitting: 240 ms
 
-    return write_file(path, compress(scene, image, **goal, **{**refinement, "seed": seed or 0}).data)
+    refinement |= {"seed": seed or 0, "min_sigma": min_sigma or 0.0}
+    return write_file(path, compress(scene, image, **goal, **refinement).data)
 
 
 def load(path: str | os.PathLike[str]) -> Scene:

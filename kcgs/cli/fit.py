@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from kcgs._atomic import write_file
-from kcgs._objectives import Purpose, objective_for
+from kcgs._objectives import Purpose
 from kcgs._progress import Progress
 from kcgs._suffixes import SCENES
 from kcgs.errors import InvalidArgument
@@ -61,7 +61,7 @@ def fit_command(
     output = output or Path(f"{image.stem}{request.default_suffix}")
     check_output(output, *(SCENES if request.target_bytes is None else (".kcgs",)))
     check_new(output, overwrite)
-    config_for(output, request)  # refuses wrong settings before the work
+    file_config(output, request)  # refuses wrong settings before the work
     request.load_device()  # and a device that torch lacks
     target = request.load_image(image)
     labels = read_regions(regions, target, threshold, resize=resize_regions, progress=not quiet)
@@ -113,7 +113,7 @@ def fit_and_save(
 
     device, start = request.load_device(), time.perf_counter()
     on_device = image.to(device), None if labels is None else labels.to(device)
-    settings: Any = {"recipe": config_for(output, request), "seed": request.seed}
+    settings: Any = {"recipe": file_config(output, request), "seed": request.seed}
     settings |= {"on_step": on_step, "progress": progress}
     if request.target_bytes is not None:
         file = fit_bytes(*on_device, request.target_bytes, **settings)
@@ -124,19 +124,16 @@ def fit_and_save(
     return SavedFit(result, scene, num_bytes, time.perf_counter() - start)
 
 
-def config_for(output: Path, request: options.FitRequest) -> FitConfig:
+def file_config(output: Path, request: options.FitRequest) -> FitConfig:
     """Return the settings of a fit for a file; refuse those that the file does not take.
 
     A compressed file needs a higher target, since rounding lowers the PSNR.
     """
-    config = request.load_config()
-    if output.suffix != ".kcgs":
-        return config
+    from kcgs.fitting import config_for
+
     purpose: Purpose = "file of a PSNR" if request.target_bytes is None else "file of a size"
-    objective_for(purpose, config.objective)
-    if config.bounded:
-        raise InvalidArgument("bounded", f"False for a {purpose}", True)
-    if request.target_bytes is not None or config.target_psnr is None:
+    config = config_for(purpose if output.suffix == ".kcgs" else "fit", request.load_config())
+    if output.suffix != ".kcgs" or request.target_bytes is not None or config.target_psnr is None:
         return config
     return config.model_copy(update={"target_psnr": config.target_psnr + _ROUNDING_MARGIN})
 
@@ -146,18 +143,16 @@ def save_result(
 ) -> tuple[Scene, int]:
     """Write the scene of a fit of one image, by the suffix of `output`; return the file's scene and size in bytes."""
     from kcgs import Scene, load
-    from kcgs.rate import compress
 
-    if output.suffix != ".kcgs":
-        num_bytes = Scene(result.scene.field, result.scene.regions, {"recipe": request.recipe}).save(output)
-        return load(output), num_bytes
-    config, min_sigma = request.load_config(), request.settings.get("min_sigma", 0.0)
-    with Progress("writing the file", pulse=True, visible=progress):
-        data, scene = compress(
-            result.scene, image, target_psnr=config.target_psnr, seed=request.seed, objective=config.objective,
-            min_sigma=min_sigma,
-        )  # fmt: skip
-        return scene, write_file(output, data)
+    scene, config = Scene(result.scene.field, result.scene.regions, {"recipe": request.recipe}), request.load_config()
+    is_rounded = output.suffix == ".kcgs"
+    rounding: dict[str, Any] = {
+        "image": image, "seed": request.seed, "target_psnr": config.target_psnr, "objective": config.objective,
+        "min_sigma": request.settings.get("min_sigma"),
+    }  # fmt: skip
+    with Progress("writing the file", pulse=True, visible=progress and is_rounded):
+        num_bytes = scene.save(output, **(rounding if is_rounded else {}))
+    return load(output), num_bytes
 
 
 def read_regions(

@@ -19,7 +19,7 @@ from kcgs.errors import InvalidArgument
 from . import options
 from .commands import app
 from .common import INTERRUPTED, Json, Quiet, print_report
-from .fit import config_for
+from .fit import file_config
 from .many_batches import make_batches, run_batch, takes_one_image
 from .many_jobs import FitJob, Outcome
 from .many_shards import Shards
@@ -107,7 +107,7 @@ def fit_many_command(
     ]
     from kcgs.engine import run_jobs
 
-    config_for(jobs[0].output, request)  # refuses wrong settings before the work
+    file_config(jobs[0].output, request)  # refuses wrong settings before the work
     single = takes_one_image(request)
     if single is not None and batch not in ("auto", "1"):
         options.exclude(f"--{single}", batch=batch)

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kcgs._objectives import objective_for
 from kcgs._suffixes import VIDEOS, WRITTEN_IMAGES
 
 from . import options
@@ -61,12 +60,12 @@ def fit_video_command(
     if output.suffix:  # none: a folder
         check_output(output, ".safetensors")
     check_new(output, overwrite)
-    config = request.load_config()
-    objective_for("video", config.objective)  # refuses another objective before the work
     from kcgs.data import load_labels
+    from kcgs.fitting import config_for
     from kcgs.functional import psnr
     from kcgs.video import fit_video, read_label_maps, read_video
 
+    config = config_for("video", request.load_config())  # refuses wrong settings before the work
     source = read_video(video, frame_rate=frame_rate)
     maps: Any
     if Path(regions).is_dir():
