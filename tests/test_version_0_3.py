@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import math
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,8 @@ import torch
 
 from kcgs import FitConfig, fit, load
 from kcgs.data import load_image
+from kcgs.fitting import make_problem
+from kcgs.fitting.checkpoint_0_3 import from_0_3
 from kcgs.segment import segment
 
 FILES = Path(__file__).parent / "version_0_3"
@@ -56,6 +60,12 @@ def test_checkpoints_are_continued(tmp_path: Path, file: str, recipe: str, guide
     assert [entry.iteration for entry in resumed.history] == [entry.iteration for entry in whole.history]
     # the fits up to 60 have the same bits only on machines of one kind
     assert resumed.psnr == pytest.approx(whole.psnr, abs=0.5)
+
+
+def test_checkpoints_of_a_scene_without_error_are_read() -> None:
+    content = torch.load(io.BytesIO((FILES / "fit.state").read_bytes()[32:]), weights_only=True)
+    problem = make_problem(IMAGE, None, 40, FitConfig(), 0)
+    assert float(from_0_3({**content, "best_value": 0.0}, problem)["best"]["numbers"][2]) == math.inf
 
 
 @pytest.mark.parametrize(

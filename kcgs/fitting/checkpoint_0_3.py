@@ -10,6 +10,7 @@ import torch
 from pydantic_core import to_json
 from torch import Tensor
 
+from .measurement import decibel
 from .problem import Problem
 
 # `objective` and `loss` in version 0.3, for each objective
@@ -38,22 +39,19 @@ def from_0_3(plain: dict[str, Any], problem: Problem) -> dict[str, Any]:
     """Return the content of a checkpoint of version 0.3 as this version's, with a batch of one image."""
     best, value = None, plain["best_value"]
     if plain["best"] is not None:
-        psnr = -10.0 * math.log10(value)
+        psnr = float(decibel(torch.tensor(value, dtype=torch.float64)))
         if not problem.objective.is_ranked_by_psnr:
             psnr = min(plain["history"], key=lambda entry: entry[2])[3]
         # 0.3 set the value to infinity when the drafts ended
         is_draft = plain["cutoff"] != problem.config.cutoff or value == math.inf
         numbers = [torch.tensor([is_draft]), *(torch.tensor([x], dtype=torch.float64) for x in (value, psnr))]
         best = {"scene": _scene(plain["best"]), "numbers": numbers}
-    optimizer = _batched(plain["optimizer"])
-    if "parameters" in optimizer:  # of a ReparametrizedOptimizer
-        optimizer["frozen"] = None
     return {
         **{name: plain[name] for name in ("cutoff", "anchor", "history", "seconds")},
         "numbers": {name: plain[name] for name in _NUMBERS},
         "scene": _scene(plain["scene"]),
         "best": best,
-        "optimizer": optimizer,
+        "optimizer": _batched(plain["optimizer"]),
         "contour_seconds": [],
     }
 

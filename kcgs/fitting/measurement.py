@@ -72,7 +72,7 @@ def record(state: FitState, measurement: Measurement, errors: Errors) -> None:
         raise InvalidArgument("objective", "a number at the first Gaussians of a fit", "NaN")
     if bool(is_missing.all()):
         return
-    psnr, ef_psnr = _decibel(errors.squared), _decibel(errors.squared_near_contours)
+    psnr, ef_psnr = decibel(errors.squared), decibel(errors.squared_near_contours)
     loss, mean_psnr, mean_ef_psnr = (float(numbers.nanmean()) for numbers in (errors.objective, psnr, ef_psnr))
     state.history.append(HistoryEntry(iteration, seconds, loss, mean_psnr, mean_ef_psnr, scene.num_gaussians))
     value = errors.squared if state.objective.is_ranked_by_psnr else errors.objective
@@ -81,6 +81,6 @@ def record(state: FitState, measurement: Measurement, errors: Errors) -> None:
     state.best = measured if state.best is None else state.best.improved_by(measured)
 
 
-def _decibel(mean_square: Tensor) -> Tensor:
+def decibel(mean_square: Tensor) -> Tensor:
     """Return the PSNR of mean squared errors, for values in [0, 1]."""
     return -10.0 * mean_square.log10()

@@ -133,7 +133,7 @@ class ReparametrizedOptimizer(ABC):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take what `state_dict` returned."""
-        self.frozen = state["frozen"]
+        self.frozen = state.get("frozen")  # version 0.3 froze none
         self._set(state["parameters"])
         self.optimizer.load_state_dict(state["optimizer"])
 
