@@ -76,7 +76,7 @@ def is_graph_retained() -> bool:
 
 
 def differentiate(output: Tensor, inputs: tuple[Tensor, ...], gradient: Tensor) -> tuple[Tensor, ...]:
-    """Call `torch.autograd.grad` without its check of the gradient's shape, which loads sympy in 0.4 s."""
+    """Call `torch.autograd.grad` without its check of the gradient's shape, which imports sympy."""
     return torch.autograd.graph._engine_run_backward(
         (output,), (gradient,), False, False, inputs, False, accumulate_grad=False
     )
