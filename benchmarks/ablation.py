@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .core.compare import Comparison, at_equal_bits, differences, losses_table, mean_gain, means_table
+from .core.compare import Comparison, at_equal_bits, differences, losses_table, mean_gain
 from .core.figures import save_differences
 from .core.fits import Method, measure_fit, plan
 from .core.images import choose
 from .core.run import Job, Options, Page, Row
+from .core.tables import means_table
 
 COUNTS = (1_250, 7_500)
 # N of further fits of `best`; at equal bytes their files are interpolated

@@ -14,12 +14,12 @@ import torch
 from kcgs import Scene
 
 from .core.clocks import milliseconds, threads
-from .core.compare import means_table, values_of
 from .core.cuda import capture, check_device, count_kernels, finish, megabytes
 from .core.figures import Panel, save_lines
 from .core.goals import Goal, goals_table, missed_goals
 from .core.run import Job, Options, Page, Row
 from .core.scenes import BATCH, BATCHES, FITTED, fits_in, scene_of
+from .core.tables import join_sections, means_table, values_of
 from .render import ANISOTROPIES, CUTOFFS, DEFAULT_CUTOFF, differentiate, differentiate_exactly, errors, needles, render
 
 # device of each kernel
@@ -163,19 +163,19 @@ def page(folder: Path, rows: list[Row]) -> Page:
         for name, limit in GOALS.get(_scene_name(row), {}).items()
         if name in row
     ]
-    tables = [
+    tables = join_sections(
         means_table(timed, ["image", "method"], "", TIMES),
         "Errors of the image / of gradients:",
         means_table(swept, ["image", "method"], "cutoff", ("image_error", "gradient_error")),
-        *(["Goals:", goals_table(goals)] if goals else []),
-    ]
+        goals_table(goals),
+    )
     sentences = [
         *_speed([row for row in ours if _scene_name(row) in SCENES_480P]),
         *_ratios(timed),
         *_exactness([row for row in swept if row["method"] == "cuda"]),
     ]
     method = f"{METHOD}\n{METHOD_OF_BATCHES}" if any(row["image"] in BATCHES for row in rows) else METHOD
-    return Page(" ".join(sentences), "gpu.png", "\n\n".join(tables), missed_goals(goals), method)
+    return Page(" ".join(sentences), "gpu.png", tables, missed_goals(goals), method)
 
 
 def _speed(rows: list[Row]) -> Iterator[str]:

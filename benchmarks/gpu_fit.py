@@ -21,13 +21,14 @@ from kcgs.functional import ef_psnr, psnr
 from kcgs.rate import fit_bytes
 
 from .core.clocks import threads
-from .core.compare import Comparison, differences, group_by, losses_table, means_table, values_of
+from .core.compare import Comparison, differences, losses_table
 from .core.cuda import check_device, finish, synchronize
 from .core.figures import Panel, save_lines
 from .core.fits import QUICK_ITERATIONS
 from .core.goals import Goal, goals_table, missed_goals
 from .core.images import FRAMES, choose, load
 from .core.run import Job, Options, Page, Row
+from .core.tables import group_by, join_sections, means_table, values_of
 
 Result = TypeVar("Result")
 
@@ -219,15 +220,10 @@ def page(folder: Path, rows: list[Row]) -> Page:
         ),
         *(f"The first fit of a {kind} takes {seconds:.2g} s longer than the next." for kind, seconds in longer.items()),
     ]
-    tables = [
-        means_table(rows, ["set", "n", "method"], "", QUANTITIES),
-        *(["Goals:", goals_table(goals)] if goals else []),
-    ]
+    table = means_table(rows, ["set", "n", "method"], "", QUANTITIES)
     methods = {row["method"] for row in rows}
     notes = [text for method, text in NOTES.items() if method in methods]
-    losses = [missed_goals(goals), losses_table(fits, COMPARISONS, ["psnr", "seconds"], ["n"])]
+    losses = join_sections(missed_goals(goals), losses_table(fits, COMPARISONS, ["psnr", "seconds"], ["n"]))
     gains = differences(fits, COMPARISONS, ["psnr", "seconds"], ["set", "n"])
-    return Page(
-        " ".join(sentences), "gpu-fit.png", "\n\n".join(tables),
-        "\n\n".join(filter(None, losses)), "\n".join([METHOD, *notes]), gains,
-    )  # fmt: skip
+    method = "\n".join([METHOD, *notes])
+    return Page(" ".join(sentences), "gpu-fit.png", join_sections(table, goals_table(goals)), losses, method, gains)

@@ -13,13 +13,13 @@ from kcgs import FitConfig, fit
 from kcgs.fitting import precompile
 
 from .core.clocks import peak_megabytes, threads
-from .core.compare import group_by, means_table
 from .core.cuda import megabytes, synchronize
 from .core.figures import Panel, save_lines
 from .core.fits import QUICK_ITERATIONS
 from .core.goals import Goal, goals_table, missed_goals
 from .core.images import choose, load
 from .core.run import Job, Options, Page, Row
+from .core.tables import group_by, join_sections, means_table
 
 COUNTS = (10_000, 30_000, 50_000, 70_000)
 QUICK_COUNTS = (100, 200)
@@ -127,8 +127,5 @@ def page(folder: Path, rows: list[Row]) -> Page:
             goals += [Goal(name, "psnr", GOAL[1], psnr, more_is_better=True), Goal(name, "seconds", GOAL[2], seconds)]
     table = means_table(rows, ["set", "method"], "n", ("psnr", "seconds", "peak_MB"))
     missing = "" if any(row["method"] == GPU for row in rows) else "No GPU was measured: that takes a CUDA device."
-    return Page(
-        " ".join(sentences), "many.png",
-        "\n\n".join([table, *(["Goals:", goals_table(goals)] if goals else [])]),
-        "\n\n".join(filter(None, [missed_goals(goals), missing])), METHOD,
-    )  # fmt: skip
+    losses = join_sections(missed_goals(goals), missing)
+    return Page(" ".join(sentences), "many.png", join_sections(table, goals_table(goals)), losses, METHOD)

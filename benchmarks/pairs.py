@@ -22,11 +22,11 @@ from kcgs.rate import fit_bytes
 from kcgs.segment import segment
 
 from .core.codecs import best_file
-from .core.compare import group_by, markdown
 from .core.figures import save_shares
 from .core.fits import QUICK_ITERATIONS
 from .core.images import load, names, resize
 from .core.run import Job, Options, Page, Row, write_rows
+from .core.tables import group_by, markdown
 
 BYTES = {f"{size} bytes": size for size in (1_000, 3_000, 8_000)}
 ENLARGEMENT = "enlargement"

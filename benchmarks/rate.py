@@ -14,21 +14,12 @@ from kcgs.functional import ssimulacra2
 from kcgs.rate import fit_bytes
 
 from .core.codecs import available_codecs, decode_file, largest_file
-from .core.compare import (
-    Comparison,
-    at_equal_bits,
-    count_wins,
-    differences,
-    group_by,
-    losses_table,
-    mean_gain,
-    means_table,
-    values_of,
-)
+from .core.compare import Comparison, at_equal_bits, count_wins, differences, losses_table, mean_gain
 from .core.figures import Panel, save_lines
 from .core.fits import QUICK_ITERATIONS, REPORTED, measure_render
 from .core.images import PHOTOS, load, load_mapped, names
 from .core.run import Job, Options, Page, Row
+from .core.tables import group_by, means_table, values_of
 
 PSNR, REGIONS, EYE = "kcgs, psnr, no regions", "kcgs, psnr", "kcgs"
 # whether the file may hold a map, and its objective

@@ -17,10 +17,10 @@ from kcgs import GaussianField, Scene
 from kcgs.functional import region_splat, scale_rotation_to_cholesky
 
 from .core.clocks import milliseconds, peak_megabytes, threads
-from .core.compare import group_by, means_table, values_of
 from .core.figures import Panel, save_lines
 from .core.run import Job, Options, Page, Row
 from .core.scenes import FITTED, scene_of
+from .core.tables import group_by, means_table, values_of
 
 CUTOFFS = (1 / 255, 1e-3, 1e-4, 1e-6)
 DEFAULT_CUTOFF = 1e-4

@@ -15,8 +15,8 @@ from matplotlib.ticker import LogLocator
 from PIL import Image
 from torch import Tensor
 
-from .compare import group_by, is_missing, title
 from .run import Row
+from .tables import group_by, is_missing, title
 
 # of Okabe and Ito; those of `kcgs.plots` have no public name, and benchmarks import only public names
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
