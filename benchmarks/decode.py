@@ -108,7 +108,7 @@ def jobs(options: Options) -> list[Job]:
 
 def page(folder: Path, rows: list[Row]) -> Page:
     """Write the report."""
-    default = [row for row in rows if abs(row["cutoff"] / DEFAULT_CUTOFF - 1) < 0.01]
+    default = [row for row in rows if row["cutoff"] == DEFAULT_CUTOFF]
     native = [row for row in rows if row["size"] == "native" and row["threads"] == 1]
     groups = {
         str(image): image_rows

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
@@ -148,7 +147,7 @@ def jobs(options: Options) -> list[Job]:
 def page(folder: Path, rows: list[Row]) -> Page:
     """Write the report."""
     swept = [row for row in rows if "image_error" in row]
-    timed = [row for row in rows if row.keys() & {*TIMES} and abs(row["cutoff"] / DEFAULT_CUTOFF - 1) < 0.01]
+    timed = [row for row in rows if row.keys() & {*TIMES} and row["cutoff"] == DEFAULT_CUTOFF]
     captured = [
         {"method": "cuda, captured", "n": row["n"], **{name: row[f"captured_{name}"] for name in EAGER}}
         for row in timed
@@ -200,8 +199,7 @@ def _ratios(rows: list[Row]) -> Iterator[str]:
 def _exactness(rows: list[Row]) -> Iterator[str]:
     """Yield the largest errors of the image."""
     default, stiff = (
-        values_of([row for row in rows if math.isclose(row["cutoff"], cutoff)], "image_error")
-        for cutoff in (DEFAULT_CUTOFF, 0.0)
+        values_of([row for row in rows if row["cutoff"] == cutoff], "image_error") for cutoff in (DEFAULT_CUTOFF, 0.0)
     )
     if default:
         yield f"The largest error of its image is {max(default):.1g} at the default cutoff."

@@ -30,18 +30,18 @@ HUGE, HUGE_COUNT = "4 x 6 photos", 300_000
 CPU, GPU = "CPU", "GPU"
 # for Kodak on a GPU: N, least PSNR in dB, largest seconds
 GOAL = (50_000, 48.5, 2.0)
-# published results on Kodak with a GPU: method, N, PSNR in dB, seconds
+# published results on Kodak with a GPU: method with its paper on arXiv, N, PSNR in dB, seconds
 PRINTED: tuple[tuple[str, int, float, float | None], ...] = (
-    ("GaussianImage++", 10_000, 35.41, None),
-    ("Structure-Guided", 30_000, 40.51, 132.0),
-    ("Structure-Guided", 70_000, 45.40, None),
-    ("Fast-2DGS", 50_000, 43.13, 10.0),
-    ("SAD, sites of a soft Voronoi diagram", 50_000, 46.0, 2.2),
+    ("GaussianImage++ (2512.19108)", 10_000, 35.41, None),
+    ("Structure-Guided (2512.24018)", 30_000, 40.51, 132.0),
+    ("Structure-Guided (2512.24018)", 70_000, 45.40, None),
+    ("Fast-2DGS (2512.12774)", 50_000, 43.13, 10.0),
+    ("SAD, sites of a soft Voronoi diagram (2604.21984)", 50_000, 46.0, 2.2),
 )
 METHOD = f"""`fit(image, None, N)` with its default settings, without compilation: the 24 photos of Kodak; images of
 four of them side by side, {len(LARGE)} of them; and one of all 24, 9.4 megapixels, with {HUGE_COUNT:,} Gaussians.
 Seconds are those of the call, on all cores of a CPU or on a GPU. MB is what a fit of the largest image adds at the
-peak. As printed, on GPUs: {
+peak. As printed, on GPUs, with the paper on arXiv: {
     "; ".join(
         f"{name} {psnr:g} dB at N = {n:,}" + (f" in {seconds:g} s" if seconds else "")
         for name, n, psnr, seconds in PRINTED

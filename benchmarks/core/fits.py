@@ -89,13 +89,14 @@ def figures(result: FitResult, seconds: float, image: Tensor, labels: Tensor) ->
     """Measure a fitted scene and its file."""
     scene, regions = result.scene, result.scene.regions
     with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # NaN: too small for MS-SSIM
-        own = evaluate(scene, image, labels)
-    file = encode(scene, quality=quality_for(own["psnr"]))
+        metrics = evaluate(scene, image, labels)
+    file = encode(scene, quality=quality_for(metrics["psnr"]))
     decoded = measure_render(decode(file).scene.render(), image, labels)
     contours = None if regions is None or regions.num_regions == 1 else regions.labels
     return {
-        "iterations": result.history[-1].iteration, "core_seconds": seconds, **{name: own[name] for name in REPORTED},
-        "ssimulacra2": own.get("ssimulacra2", math.nan), "bytes": len(file), "bpp": 8 * len(file) / image[0].numel(),
+        "iterations": result.history[-1].iteration, "core_seconds": seconds,
+        **{name: metrics[name] for name in REPORTED}, "ssimulacra2": metrics.get("ssimulacra2", math.nan),
+        "bytes": len(file), "bpp": 8 * len(file) / image[0].numel(),
         "map_bytes": 0 if contours is None else len(encode_labels(contours)),
         **{f"decoded_{name}": value for name, value in decoded.items()},
     }  # fmt: skip
@@ -104,9 +105,7 @@ def figures(result: FitResult, seconds: float, image: Tensor, labels: Tensor) ->
 def measure_render(render: Tensor, image: Tensor, labels: Tensor | None) -> Row:
     """Return the metrics of a render; those of contours where there are labels."""
     row: Row = {}
-    with warnings.catch_warnings():
-        # NaN: the image is too small for MS-SSIM
-        warnings.simplefilter("ignore", RuntimeWarning)
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # NaN: too small for MS-SSIM
         for name, metric in REPORTED.items():
             if not name.startswith("ef_"):
                 row[name] = float(metric(render, image))

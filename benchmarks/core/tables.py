@@ -106,19 +106,22 @@ def means_table(
 
     A mean of fewer images than others of its line has their number behind it.
     """
-    values: list[Any] = list(group_by(rows, [along])) if along else [()]
+    values = list(group_by(rows, [along])) if along else []
     lines = []
     for key, group in group_by(rows, names).items():
-        by_value = group_by(group, [along] if along else [])
-        cells = [_mean_cells(by_value.get(value, []), quantities, sign) for value in values]
-        counts = [len(group_by(by_value.get(value, []), ["image"])) for value in values]
-        joined = [
-            " / ".join(filter(None, cell)) + (f" ({count})" if 0 < count < max(counts) else "")
-            for cell, count in zip(cells, counts, strict=True)
-        ]
-        joined = joined if along else cells[0]
-        lines.append([*map(format_value, names, key), *joined])
-    header = [_column_header(along, *value) for value in values] if along else map(title, quantities)
+        if along:
+            by_value = group_by(group, [along])
+            parts = [by_value.get(value, []) for value in values]
+            counts = [len(group_by(part, ["image"])) for part in parts]
+            cells = [
+                " / ".join(filter(None, _mean_cells(part, quantities, sign)))
+                + (f" ({count})" if 0 < count < max(counts) else "")
+                for part, count in zip(parts, counts, strict=True)
+            ]
+        else:
+            cells = _mean_cells(group, quantities, sign)
+        lines.append([*map(format_value, names, key), *cells])
+    header = [_column_header(along, value) for (value,) in values] if along else map(title, quantities)
     return markdown([*map(title, names), *header], lines)
 
 
