@@ -6,7 +6,7 @@ from pathlib import Path
 
 from .core.compare import Comparison, at_equal_bits, count_wins, differences, losses_table, mean_gain
 from .core.figures import Panel, save_lines
-from .core.fits import METHODS, QUICK_ITERATIONS, figures, fit_for, method_of, timed_fit
+from .core.fits import METHODS, QUICK_ITERATIONS, fit_for, measure_result, method_of, timed_fit
 from .core.images import PHOTOS, load_mapped, names
 from .core.run import Job, Options, Page, Row
 from .core.tables import group_by, join_tables, means_table
@@ -40,7 +40,7 @@ def measure(image: str, group: str, n: int, data: str, quick: bool) -> list[Row]
             length = QUICK_ITERATIONS if quick else None
             result, seconds = timed_fit(pixels, labels, n, method_of(method, length))
         row = {"image": image, "group": group, "n": n, "method": method}
-        rows.append(row | figures(result, seconds, pixels, labels))
+        rows.append(row | measure_result(result, seconds, pixels, labels))
     return rows
 
 

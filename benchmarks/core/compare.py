@@ -15,11 +15,11 @@ from scipy.interpolate import PchipInterpolator
 from .run import Row
 from .tables import column_of, format_value, group_by, is_missing, markdown, title
 
-# of the bootstrap
+# samples of the bootstrap
 _NUM_SAMPLES = 10_000
-# in the logarithm of bytes: how far a curve is continued beyond its ends, 5 %
+# a curve is continued so far beyond its ends, in the logarithm of bytes: 5 %
 _CURVE_MARGIN = math.log(1.05)
-# images that a table of losses names
+# number of images that a line of a table of losses names
 _NUM_WORST = 3
 
 
@@ -61,7 +61,7 @@ class Gain(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """Two methods."""
+    """Two methods whose results are compared, image by image."""
 
     first: str
     second: str
