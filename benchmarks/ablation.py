@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .core.compare import Comparison, at_equal_bits, differences, losses_table, mean_gain, means_table
+from .core.compare import Comparison, at_equal_bits, differences, losses_table, mean_gain
 from .core.figures import save_differences
 from .core.fits import Method, measure_fit, plan
 from .core.images import choose
 from .core.run import Job, Options, Page, Row
+from .core.tables import means_table
 
 COUNTS = (1_250, 7_500)
 # N of further fits of `best`; at equal bytes their files are interpolated
@@ -53,8 +54,8 @@ def page(folder: Path, rows: list[Row]) -> Page:
     at_n = differences(rows_of_parts, PARTS, QUANTITIES, ["n"])
     at_bits = []
     for comparison in EQUAL_BITS:
-        own = [row for row in equal if row["method"] == comparison.first or row.get("part") == comparison.first]
-        at_bits += differences(own, [comparison], DECODED, ["n"])
+        pair = [row for row in equal if comparison.first in (row["method"], row.get("part"))]
+        at_bits += differences(pair, [comparison], DECODED, ["n"])
     lines = [{**row, "method": row["method"].removesuffix(" - best"), "case": f"N = {row['n']:,}"} for row in at_n]
     for row in at_bits:
         values = {q: row[d] for q, d in zip(QUANTITIES, DECODED, strict=True) if d in row}

@@ -16,13 +16,13 @@ from kcgs import FitConfig, fit
 from kcgs.fitting import precompile
 
 from .core.clocks import peak_megabytes, threads
-from .core.compare import group_by, means_table
 from .core.cuda import megabytes, synchronize
 from .core.figures import Panel, save_lines
 from .core.fits import QUICK_ITERATIONS
 from .core.goals import Goal, goals_table, missed_goals
 from .core.images import choose, load, resize
 from .core.run import Job, Options, Page, Row
+from .core.tables import group_by, join_sections, means_table
 
 KODAK = "Kodak"
 # by size of crop: N, the factor by which photos are reduced, the batch sizes on one core, the batch sizes on a GPU
@@ -171,10 +171,8 @@ def page(folder: Path, rows: list[Row]) -> Page:
         )
         goals.append(Goal(name, "difference", MOST_DIFFERENCE, worst))
     columns = ("images_per_second", "times as fast", "psnr", "difference", "peak_MB")
-    tables = [means_table(rows, ["method", "image", "n", "batch"], "", columns), "Goals:", goals_table(goals)]
+    table = means_table(rows, ["method", "image", "n", "batch"], "", columns)
     has_gpu = any(row["method"] == GPU for row in rows)
     missing = "" if has_gpu else "No GPU was measured: that takes a CUDA device."
-    return Page(
-        " ".join(sentences), "batch.png",
-        "\n\n".join(tables), "\n\n".join(filter(None, [missed_goals(goals), missing])), METHOD,
-    )  # fmt: skip
+    losses = join_sections(missed_goals(goals), missing)
+    return Page(" ".join(sentences), "batch.png", join_sections(table, goals_table(goals)), losses, METHOD)

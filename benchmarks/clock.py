@@ -10,10 +10,11 @@ from kcgs.functional import ef_psnr, psnr
 from kcgs.segment import segment
 
 from .core.clocks import threads
-from .core.compare import Comparison, losses_table, means_table
+from .core.compare import Comparison, losses_table
 from .core.figures import Panel, save_lines
 from .core.images import load
 from .core.run import Job, Options, Page, Row
+from .core.tables import means_table
 
 # photos of Kodak side by side, and the seconds of each
 SECONDS = {"1 x 2 photos": 20, "2 x 4 photos": 20, "4 x 8 photos": 60}

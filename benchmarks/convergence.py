@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from statistics import fmean
 
-from .core.compare import Comparison, differences, group_by, losses_table, means_table, values_of
+from .core.compare import Comparison, differences, losses_table
 from .core.figures import Panel, save_lines
-from .core.fits import METHODS, QUICK_ITERATIONS, figures, fit_for, method_of, timed_fit
+from .core.fits import METHODS, QUICK_ITERATIONS, fit_for, measure_result, method_of, timed_fit
 from .core.images import choose, load_mapped
 from .core.run import RESULTS_FILE, Job, Options, Page, Row, read_rows
+from .core.tables import group_by, means_table, values_of
 from .gpu_fit import GPU
 
 OTHERS = [*METHODS][1:]
@@ -37,7 +38,7 @@ def measure(image: str, method: str, n: int, data: str, quick: bool) -> list[Row
         else:
             result, seconds = fit_for(budget, pixels, labels, n, method)
         row = {"image": image, "method": method, "budget": budget}
-        rows.append(row | figures(result, seconds, pixels, labels))
+        rows.append(row | measure_result(result, seconds, pixels, labels))
     return rows
 
 

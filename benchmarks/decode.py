@@ -18,10 +18,10 @@ from kcgs import RegionSplatRenderer, Scene, load
 from kcgs.onnx import scene_decoder
 
 from .core.clocks import milliseconds, peak_megabytes, threads
-from .core.compare import group_by, means_table, values_of
 from .core.figures import Panel, save_lines
 from .core.run import Job, Options, Page, Row
 from .core.scenes import FITTED, SIZES, scene_of, size_of
+from .core.tables import group_by, means_table, values_of
 
 CUTOFFS = (1e-2, 1 / 255, 1e-3, 1e-4, 1e-6)
 DEFAULT_CUTOFF = 1e-4
@@ -108,7 +108,7 @@ def jobs(options: Options) -> list[Job]:
 
 def page(folder: Path, rows: list[Row]) -> Page:
     """Write the report."""
-    default = [row for row in rows if abs(row["cutoff"] / DEFAULT_CUTOFF - 1) < 0.01]
+    default = [row for row in rows if row["cutoff"] == DEFAULT_CUTOFF]
     native = [row for row in rows if row["size"] == "native" and row["threads"] == 1]
     groups = {
         str(image): image_rows

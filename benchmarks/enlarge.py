@@ -13,11 +13,12 @@ from kcgs import fit
 from kcgs.functional import ef_psnr, psnr
 
 from .core.clocks import milliseconds
-from .core.compare import Comparison, count_wins, differences, group_by, losses_table, mean_gain, means_table
+from .core.compare import Comparison, count_wins, differences, losses_table, mean_gain
 from .core.figures import Panel, save_lines
 from .core.fits import QUICK_ITERATIONS
 from .core.images import load_mapped, names, resize
 from .core.run import Job, Options, Page, Row
+from .core.tables import group_by, means_table
 
 FACTORS = (2, 4)
 # pixels of the small photo per Gaussian

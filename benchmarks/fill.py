@@ -17,11 +17,12 @@ from kcgs import fit
 from kcgs.data import load_image, save_image
 from kcgs.editing import delete_region, move_region
 
-from .core.compare import Comparison, losses_table, means_table, values_of
+from .core.compare import Comparison, losses_table
 from .core.figures import save_rows
 from .core.fits import QUICK_ITERATIONS
 from .core.images import load, names
 from .core.run import Job, Options, Page, Row
+from .core.tables import means_table, values_of
 
 NUM_GAUSSIANS = 3_000
 QUICK_GAUSSIANS = 60

@@ -21,13 +21,14 @@ from kcgs.functional import ef_psnr, psnr
 from kcgs.rate import fit_bytes
 
 from .core.clocks import threads
-from .core.compare import Comparison, differences, group_by, losses_table, means_table, values_of
+from .core.compare import Comparison, differences, losses_table
 from .core.cuda import check_device, finish, synchronize
 from .core.figures import Panel, save_lines
 from .core.fits import QUICK_ITERATIONS
 from .core.goals import Goal, goals_table, missed_goals
 from .core.images import FRAMES, choose, load
 from .core.run import Job, Options, Page, Row
+from .core.tables import group_by, join_sections, means_table, values_of
 
 Result = TypeVar("Result")
 
@@ -60,14 +61,18 @@ GOAL_OF_A_FIRST_FIT = 15.0
 CACHES = ("NUMBA_CACHE_DIR", "TRITON_CACHE_DIR")
 COMPARISONS = (Comparison(GPU, CORES), Comparison(GPU, OTHER), Comparison(FILE_GPU, FILE_CORES))
 QUANTITIES = ("images", "seconds", "next_seconds", "process_seconds", "iterations", "psnr", "ef_psnr")
-METHOD = f"""Photos of Kodak without regions, and first frames of DAVIS with the given masks. Seconds are those of the
+METHOD = """Photos of Kodak without regions, and first frames of DAVIS with the given masks. Seconds are those of the
 call of `fit`, image and mask on the device, the GPU waited for; a short fit of the same size comes before, and is not
-in them. *GPU* is a GPU, *cores* all cores beside it. `gaussian-image` has {METHODS[OTHER][1]["iterations"]:,}
-iterations, a tenth of its own. *new process* is the first fit of a process, *new machine* that with empty caches of
-compiled code; *next* is the second fit of that process, and *process seconds* begin before Python starts."""
-# where files were measured
-METHOD_OF_FILES = f"""*file* is `fit_bytes` without a mask, in {FILE_BYTES:,} bytes for PSNR; its PSNR is that of the
-decoded scene."""
+in them. *GPU* is a GPU, *cores* all cores beside it."""
+# further lines for reports that have the method
+NOTES = {
+    OTHER: f"`gaussian-image` has {METHODS[OTHER][1]['iterations']:,} iterations, a tenth of its own.",
+    FIRST["process"]: """*new process* is the first fit of a process, and *next* the second fit of that process;
+*process seconds* begin before Python starts.""",
+    FIRST["machine"]: "*new machine* is the first fit of a process with empty caches of compiled code.",
+    FILE_GPU: f"""*file* is `fit_bytes` without a mask, in {FILE_BYTES:,} bytes for PSNR; its PSNR is that of the
+decoded scene.""",
+}
 
 
 def set_of(image: str) -> str:
@@ -215,14 +220,10 @@ def page(folder: Path, rows: list[Row]) -> Page:
         ),
         *(f"The first fit of a {kind} takes {seconds:.2g} s longer than the next." for kind, seconds in longer.items()),
     ]
-    tables = [
-        means_table(rows, ["set", "n", "method"], "", QUANTITIES),
-        *(["Goals:", goals_table(goals)] if goals else []),
-    ]
-    has_files = any(row["method"] == FILE_GPU for row in rows)
-    losses = [missed_goals(goals), losses_table(fits, COMPARISONS, ["psnr", "seconds"], ["n"])]
+    table = means_table(rows, ["set", "n", "method"], "", QUANTITIES)
+    methods = {row["method"] for row in rows}
+    notes = [text for method, text in NOTES.items() if method in methods]
+    losses = join_sections(missed_goals(goals), losses_table(fits, COMPARISONS, ["psnr", "seconds"], ["n"]))
     gains = differences(fits, COMPARISONS, ["psnr", "seconds"], ["set", "n"])
-    return Page(
-        " ".join(sentences), "gpu-fit.png", "\n\n".join(tables),
-        "\n\n".join(filter(None, losses)), METHOD + (f" {METHOD_OF_FILES}" if has_files else ""), gains,
-    )  # fmt: skip
+    method = "\n".join([METHOD, *notes])
+    return Page(" ".join(sentences), "gpu-fit.png", join_sections(table, goals_table(goals)), losses, method, gains)

@@ -19,10 +19,11 @@ from kcgs.codec import decode_labels, encode_labels
 from kcgs.data import load_labels
 from kcgs.segment import segment
 
-from .core.compare import Comparison, count_wins, group_by, losses_table, means_table, values_of
+from .core.compare import Comparison, count_wins, losses_table
 from .core.figures import Panel, save_lines
 from .core.images import load
 from .core.run import Job, Options, Page, Row
+from .core.tables import group_by, means_table, values_of
 
 # paths of the maps in the data; none of Kodak, because the tables of kcgs were trained on maps of Kodak
 SETS = {
@@ -162,10 +163,5 @@ def page(folder: Path, rows: list[Row]) -> Page:
         f"others {min(others):.0f} to {max(others):.0f}."
     )
     table = means_table(rows, ["group", "method"], "", ("bytes", "bytes to WebP, %", "encode_speed", "decode_speed"))
-    return Page(
-        answer,
-        "labels.png",
-        table,
-        losses_table(rows, comparisons, ["bytes", "decode_speed"], ["group"]),
-        METHOD,
-    )
+    losses = losses_table(rows, comparisons, ["bytes", "decode_speed"], ["group"])
+    return Page(answer, "labels.png", table, losses, METHOD)

@@ -20,10 +20,10 @@ from kcgs.data import SceneDataset, save_shard
 
 from .batch import crops
 from .core.clocks import threads
-from .core.compare import means_table
 from .core.figures import Panel, save_lines
 from .core.goals import Goal, goals_table, missed_goals
 from .core.run import Job, Options, Page, Row
+from .core.tables import join_sections, means_table
 
 SHARDS, PNG, JPEG = "shards of Gaussians", "PNG", "JPEG"
 # number of Gaussians of a scene, by the size of its image
@@ -128,7 +128,4 @@ def page(folder: Path, rows: list[Row]) -> Page:
         for image, ratio in ratios.items()
     )
     table = means_table(rows, ["image", "n", "method"], "", ("images_per_second", "times JPEG", "bytes"))
-    return Page(
-        answer, "loading.png",
-        f"{table}\n\nGoals:\n\n{goals_table(goals)}", missed_goals(goals), METHOD,
-    )  # fmt: skip
+    return Page(answer, "loading.png", join_sections(table, goals_table(goals)), missed_goals(goals), METHOD)

@@ -13,13 +13,13 @@ from kcgs import FitConfig, fit
 from kcgs.fitting import precompile
 
 from .core.clocks import peak_megabytes, threads
-from .core.compare import group_by, means_table
 from .core.cuda import megabytes, synchronize
 from .core.figures import Panel, save_lines
 from .core.fits import QUICK_ITERATIONS
 from .core.goals import Goal, goals_table, missed_goals
 from .core.images import choose, load
 from .core.run import Job, Options, Page, Row
+from .core.tables import group_by, join_sections, means_table
 
 COUNTS = (10_000, 30_000, 50_000, 70_000)
 QUICK_COUNTS = (100, 200)
@@ -30,18 +30,18 @@ HUGE, HUGE_COUNT = "4 x 6 photos", 300_000
 CPU, GPU = "CPU", "GPU"
 # for Kodak on a GPU: N, least PSNR in dB, largest seconds
 GOAL = (50_000, 48.5, 2.0)
-# published results on Kodak with a GPU: method, N, PSNR in dB, seconds
+# published results on Kodak with a GPU: method with its paper on arXiv, N, PSNR in dB, seconds
 PRINTED: tuple[tuple[str, int, float, float | None], ...] = (
-    ("GaussianImage++", 10_000, 35.41, None),
-    ("Structure-Guided", 30_000, 40.51, 132.0),
-    ("Structure-Guided", 70_000, 45.40, None),
-    ("Fast-2DGS", 50_000, 43.13, 10.0),
-    ("SAD, sites of a soft Voronoi diagram", 50_000, 46.0, 2.2),
+    ("GaussianImage++ (2512.19108)", 10_000, 35.41, None),
+    ("Structure-Guided (2512.24018)", 30_000, 40.51, 132.0),
+    ("Structure-Guided (2512.24018)", 70_000, 45.40, None),
+    ("Fast-2DGS (2512.12774)", 50_000, 43.13, 10.0),
+    ("SAD, sites of a soft Voronoi diagram (2604.21984)", 50_000, 46.0, 2.2),
 )
 METHOD = f"""`fit(image, None, N)` with its default settings, without compilation: the 24 photos of Kodak; images of
 four of them side by side, {len(LARGE)} of them; and one of all 24, 9.4 megapixels, with {HUGE_COUNT:,} Gaussians.
 Seconds are those of the call, on all cores of a CPU or on a GPU. MB is what a fit of the largest image adds at the
-peak. As printed, on GPUs: {
+peak. As printed, on GPUs, with the paper on arXiv: {
     "; ".join(
         f"{name} {psnr:g} dB at N = {n:,}" + (f" in {seconds:g} s" if seconds else "")
         for name, n, psnr, seconds in PRINTED
@@ -127,8 +127,5 @@ def page(folder: Path, rows: list[Row]) -> Page:
             goals += [Goal(name, "psnr", GOAL[1], psnr, more_is_better=True), Goal(name, "seconds", GOAL[2], seconds)]
     table = means_table(rows, ["set", "method"], "n", ("psnr", "seconds", "peak_MB"))
     missing = "" if any(row["method"] == GPU for row in rows) else "No GPU was measured: that takes a CUDA device."
-    return Page(
-        " ".join(sentences), "many.png",
-        "\n\n".join([table, *(["Goals:", goals_table(goals)] if goals else [])]),
-        "\n\n".join(filter(None, [missed_goals(goals), missing])), METHOD,
-    )  # fmt: skip
+    losses = join_sections(missed_goals(goals), missing)
+    return Page(" ".join(sentences), "many.png", join_sections(table, goals_table(goals)), losses, METHOD)

@@ -7,11 +7,12 @@ from pathlib import Path
 
 from kcgs.segment import segment
 
-from .core.compare import Comparison, at_equal_bits, differences, join_tables, losses_table, mean_gain, means_table
+from .core.compare import Comparison, at_equal_bits, differences, losses_table, mean_gain
 from .core.figures import Panel, save_lines
-from .core.fits import QUICK_ITERATIONS, figures, timed_fit
+from .core.fits import QUICK_ITERATIONS, measure_result, timed_fit
 from .core.images import PHOTOS, load, names
 from .core.run import Job, Options, Page, Row
+from .core.tables import join_tables, means_table
 
 COUNTS = (200, 400, 1_000)
 # N of further fits without a map; at equal bytes their files are interpolated
@@ -36,7 +37,7 @@ def measure(image: str, n: int, methods: list[str], data: str, quick: bool) -> l
     for method in methods:
         recipe = "best" if method == MAP else "best-baseline"
         result, seconds = timed_fit(pixels, labels, n, (recipe, length))
-        rows.append({**row, "method": method, **figures(result, seconds, pixels, labels)})
+        rows.append({**row, "method": method, **measure_result(result, seconds, pixels, labels)})
     return rows
 
 

@@ -15,10 +15,10 @@ from scipy.ndimage import distance_transform_edt, label
 from kcgs.data import Davis
 from kcgs.segment import segment_with_scores
 
-from .core.compare import group_by, means_table
 from .core.figures import Panel, save_lines
 from .core.images import load
 from .core.run import Job, Options, Page, Row
+from .core.tables import group_by, means_table
 
 # the segmenter, and whether it gets a box
 METHODS = {"grabcut, box": ("grabcut", True), "object": ("object", False), "object, box": ("object", True)}
@@ -114,7 +114,4 @@ def page(folder: Path, rows: list[Row]) -> Page:
         if failures := ", ".join(image for image, iou in overlaps.items() if iou < BAD):
             losses.append(f"- `{method}` and {number} clicks, below {BAD}: {failures}")
     table = means_table(rows, ["method", "clicks"], "", ("iou", "good", "failed", "core_seconds"))
-    return Page(
-        " ".join(sentences), "objects.png", table,
-        "\n".join(losses), METHOD,
-    )  # fmt: skip
+    return Page(" ".join(sentences), "objects.png", table, "\n".join(losses), METHOD)

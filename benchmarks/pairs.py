@@ -22,11 +22,11 @@ from kcgs.rate import fit_bytes
 from kcgs.segment import segment
 
 from .core.codecs import best_file
-from .core.compare import group_by, markdown
 from .core.figures import save_shares
 from .core.fits import QUICK_ITERATIONS
 from .core.images import load, names, resize
 from .core.run import Job, Options, Page, Row, write_rows
+from .core.tables import group_by, markdown
 
 BYTES = {f"{size} bytes": size for size in (1_000, 3_000, 8_000)}
 ENLARGEMENT = "enlargement"
@@ -183,13 +183,6 @@ def page(folder: Path, rows: list[Row]) -> Page:
         line = [str(comparison), f"{won} of {len(balances)}", str(lost), *(str(signs[sign]) for sign in (1, -1, 0))]
         lines.append(line)
         losses += [(balance, str(comparison), str(image)) for image, balance in balances.items() if balance < 0]
-    checks = []
-    for (viewer,), group in group_by(answers, ["viewer"]).items():
-        signs_of_pairs = {(row["comparison"], row["image"]): _sign(row) for row in group if row["kind"] == "pair"}
-        swapped, identical = ([row for row in group if row["kind"] == kind] for kind in ("swapped", "identical"))
-        alike = sum(signs_of_pairs.get((row["comparison"], row["image"])) == _sign(row) for row in swapped)
-        differences = sum(row["choice"] != "none" for row in identical)
-        checks.append(f"{viewer} {alike} of {len(swapped)} and {len(identical) - differences} of {len(identical)}")
     if answers:
         write_rows(folder / "answers.csv", answers)
     texts = [_loss(folder, by_pair[comparison, image]) for _, comparison, image in sorted(losses)]
@@ -203,9 +196,20 @@ def page(folder: Path, rows: list[Row]) -> Page:
         else "Nobody has answered yet."
     )
     header = ["comparison", "kcgs preferred", "other preferred", "answers for kcgs", "for the other", "for none"]
-    checked = f"The same answer with sides swapped, and none for equal images: {'; '.join(checks)}." if checks else ""
     losses_text = markdown(["comparison", "photo", "what viewers said", "sheet"], texts) if texts else ""
-    return Page(answer, "pairs.png", markdown(header, lines), losses_text, f"{METHOD} {published} {checked}")
+    return Page(answer, "pairs.png", markdown(header, lines), losses_text, f"{METHOD} {published} {_checks(answers)}")
+
+
+def _checks(answers: list[Row]) -> str:
+    """Say how often each viewer's answers agree with sides swapped, and are none for equal images."""
+    checks = []
+    for (viewer,), group in group_by(answers, ["viewer"]).items():
+        signs_of_pairs = {(row["comparison"], row["image"]): _sign(row) for row in group if row["kind"] == "pair"}
+        swapped, identical = ([row for row in group if row["kind"] == kind] for kind in ("swapped", "identical"))
+        alike = sum(signs_of_pairs.get((row["comparison"], row["image"])) == _sign(row) for row in swapped)
+        none = sum(row["choice"] == "none" for row in identical)
+        checks.append(f"{viewer} {alike} of {len(swapped)} and {none} of {len(identical)}")
+    return f"The same answer with sides swapped, and none for equal images: {'; '.join(checks)}." if checks else ""
 
 
 def _sign(answer: Row) -> int:

@@ -20,11 +20,12 @@ from kcgs.functional import psnr, ssimulacra2
 from kcgs.rate import fit_bytes
 
 from .core.codecs import best_file
-from .core.compare import Comparison, count_wins, differences, group_by, losses_table, mean_gain, means_table
+from .core.compare import Comparison, count_wins, differences, losses_table, mean_gain
 from .core.figures import save_rows
 from .core.fits import QUICK_ITERATIONS
 from .core.images import load, names, resize
 from .core.run import Job, Options, Page, Row
+from .core.tables import group_by, means_table
 
 BYTES = (200, 400, 1_000)
 FIGURE_BYTES = 1_000

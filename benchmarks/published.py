@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .core.compare import Comparison, count_wins, differences, group_by, losses_table, mean_gain, means_table
+from .core.compare import Comparison, count_wins, differences, losses_table, mean_gain
 from .core.figures import Panel, save_lines
 from .core.fits import Method, measure_fit, plan
 from .core.images import CHARTS, FRAMES
 from .core.run import Job, Options, Page, Row
+from .core.tables import group_by, means_table
 
 METHODS: dict[str, Method] = {
     name: (name, {}) for name in ("best", "best-baseline", "paper", "gaussian-image", "gaussian-image-clamp")

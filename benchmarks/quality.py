@@ -4,21 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .core.compare import (
-    Comparison,
-    at_equal_bits,
-    count_wins,
-    differences,
-    group_by,
-    join_tables,
-    losses_table,
-    mean_gain,
-    means_table,
-)
+from .core.compare import Comparison, at_equal_bits, count_wins, differences, losses_table, mean_gain
 from .core.figures import Panel, save_lines
-from .core.fits import METHODS, QUICK_ITERATIONS, figures, fit_for, method_of, timed_fit
+from .core.fits import METHODS, QUICK_ITERATIONS, fit_for, measure_result, method_of, timed_fit
 from .core.images import PHOTOS, load_mapped, names
 from .core.run import Job, Options, Page, Row
+from .core.tables import group_by, join_tables, means_table
 
 PUBLISHED = [*METHODS][2:]
 COUNTS = {"DAVIS": (500, 1_250, 2_500, 5_000, 7_500, 10_000), "Kodak": (1_250, 10_000), "photos": (500, 1_250)}
@@ -49,7 +40,7 @@ def measure(image: str, group: str, n: int, data: str, quick: bool) -> list[Row]
             length = QUICK_ITERATIONS if quick else None
             result, seconds = timed_fit(pixels, labels, n, method_of(method, length))
         row = {"image": image, "group": group, "n": n, "method": method}
-        rows.append(row | figures(result, seconds, pixels, labels))
+        rows.append(row | measure_result(result, seconds, pixels, labels))
     return rows
 
 
@@ -95,11 +86,5 @@ def page(folder: Path, rows: list[Row]) -> Page:
     )
     losses = losses_table(rows, COMPARISONS, QUANTITIES, CASES)
     losses_at_bits = losses_table(equal, [EQUAL_BITS], DECODED, CASES)
-    return Page(
-        answer,
-        "quality.png",
-        means_table(rows, ["group", "method"], "n", QUANTITIES),
-        join_tables(losses, losses_at_bits),
-        METHOD,
-        gains,
-    )
+    table = means_table(rows, ["group", "method"], "n", QUANTITIES)
+    return Page(answer, "quality.png", table, join_tables(losses, losses_at_bits), METHOD, gains)

@@ -14,21 +14,12 @@ from kcgs.functional import ssimulacra2
 from kcgs.rate import fit_bytes
 
 from .core.codecs import available_codecs, decode_file, largest_file
-from .core.compare import (
-    Comparison,
-    at_equal_bits,
-    count_wins,
-    differences,
-    group_by,
-    losses_table,
-    mean_gain,
-    means_table,
-    values_of,
-)
+from .core.compare import Comparison, at_equal_bits, count_wins, differences, losses_table, mean_gain
 from .core.figures import Panel, save_lines
 from .core.fits import QUICK_ITERATIONS, REPORTED, measure_render
 from .core.images import PHOTOS, load, load_mapped, names
 from .core.run import Job, Options, Page, Row
+from .core.tables import group_by, means_table, values_of
 
 PSNR, REGIONS, EYE = "kcgs, psnr, no regions", "kcgs, psnr", "kcgs"
 # whether the file may hold a map, and its objective
@@ -46,7 +37,7 @@ COMPARISONS = (
     *(Comparison(EYE, other) for other in ("JPEG", "WebP", "AVIF")),
 )
 CASES = ["group", "target_bytes"]
-# mean PSNR in dB over Kodak's 24 photos, as published by the authors of these codecs
+# mean PSNR in dB over Kodak's 24 photos at BYTES, from curves that the authors of C3 published
 PRINTED = {
     "VTM": (27.55, 29.49, 32.08, 34.37),
     "C3": (27.06, 29.05, 31.71, 34.22),
@@ -58,9 +49,10 @@ defaults, so for the eye, with the given map or the one that `segment` finds; `k
 objective. Other codecs make their largest file of at most so many bytes; where that is impossible, the table
 leaves the image out, and has the number of the others behind the mean: JPEG optimized and progressive, 4:2:0 or 4:4:4,
 WebP with method 6, AVIF with speed 4. Table: PSNR in dB / SSIMULACRA2; sizes are 0.08, 0.15, 0.3, 0.5 and 0.8 bits per
-pixel of Kodak. Figures *as printed* are those of the codecs' authors, over the same
-24 photos. BD-rate is how many more bytes the first takes for the same PSNR (monotone cubics over the logarithm of the
-bytes). Losses are at equal bits: the other's quality is interpolated between its own files of that image."""
+pixel of Kodak. Figures *as printed* are over the same 24 photos, interpolated between those that the authors of C3
+(arXiv 2312.02753) published with their program, in `baselines/kodak.py`. BD-rate is how many more bytes the first
+takes for the same PSNR (monotone cubics over the logarithm of the bytes). Losses are at equal bits: the other's quality
+is interpolated between its own files of that image."""
 
 
 def measure(image: str, group: str, method: str, sizes: list[int], data: str, quick: bool) -> list[Row]:

@@ -17,13 +17,15 @@ from kcgs import GaussianField, Scene
 from kcgs.functional import region_splat, scale_rotation_to_cholesky
 
 from .core.clocks import milliseconds, peak_megabytes, threads
-from .core.compare import group_by, means_table, values_of
 from .core.figures import Panel, save_lines
 from .core.run import Job, Options, Page, Row
 from .core.scenes import FITTED, scene_of
+from .core.tables import group_by, means_table, values_of
 
 CUTOFFS = (1 / 255, 1e-3, 1e-4, 1e-6)
 DEFAULT_CUTOFF = 1e-4
+# those of a CPU; the experiment `gpu` times the others
+BACKENDS = ("cpu", "tiled")
 ROUNDS = 9
 # numbers of cores to time, as far as the machine has them
 CORES = (1, 2, 4, 8, 16)
@@ -110,11 +112,11 @@ def measure(image: str, cutoffs: list[float], rounds: int) -> list[Row]:
     if image.startswith("needles"):
         scene = needles(float(image.split()[1]))
         truth, row = differentiate_exactly(scene), {"image": image, "threads": 1, "cutoff": 0.0}
-        return [{**row, "method": name, **errors(truth, scene, name, 0.0)} for name in backends()]
+        return [{**row, "method": name, **errors(truth, scene, name, 0.0)} for name in BACKENDS]
     scene = scene_of(image)
     has_reference = math.prod(scene.size) * scene.field.num_gaussians < LARGEST_REFERENCE
     exact = differentiate_exactly(scene) if has_reference else None
-    keys = [(backend, cutoff, count) for backend in backends() for cutoff in cutoffs for count in cores()]
+    keys = [(backend, cutoff, count) for backend in BACKENDS for cutoff in cutoffs for count in cores()]
     with torch.no_grad():
         forward = milliseconds({k: partial(on_threads, k[2], partial(render, scene, *k[:2])) for k in keys}, rounds)
     both = milliseconds({k: partial(on_threads, k[2], partial(differentiate, scene, *k[:2])) for k in keys}, rounds)
@@ -127,11 +129,6 @@ def measure(image: str, cutoffs: list[float], rounds: int) -> list[Row]:
             row["peak_MB"] = peak_megabytes(render_by_name, image, backend, warm_up=("W3", backend))
         rows.append(row)
     return rows
-
-
-def backends() -> list[str]:
-    """Return the names of the backends that run on a CPU; the experiment `gpu` times the others."""
-    return ["cpu", "tiled"]
 
 
 def jobs(options: Options) -> list[Job]:
@@ -147,7 +144,7 @@ def jobs(options: Options) -> list[Job]:
 def page(folder: Path, rows: list[Row]) -> Page:
     """Write the report."""
     timed = [row for row in rows if "both_ms" in row]
-    default = [row for row in timed if abs(row["cutoff"] / DEFAULT_CUTOFF - 1) < 0.01]
+    default = [row for row in timed if row["cutoff"] == DEFAULT_CUTOFF]
     swept = [row for row in timed if "image_error" in row]
     groups, scales = group_by(swept, ["image"]), ("log", "log")
     panels = [Panel(str(image), group, "both_ms", "image_error", scales) for (image,), group in groups.items()]

@@ -14,11 +14,12 @@ from kcgs.fitting import precompile
 from kcgs.functional import ef_psnr, psnr
 from kcgs.video import fit_video, read_label_maps, read_video
 
-from .core.compare import Comparison, differences, losses_table, mean_gain, means_table, values_of
+from .core.compare import Comparison, differences, losses_table, mean_gain
 from .core.figures import Panel, save_lines
 from .core.fits import QUICK_ITERATIONS
 from .core.images import load
 from .core.run import Job, Options, Page, Row
+from .core.tables import means_table, values_of
 
 NUM_GAUSSIANS = 1_250
 NUM_FRAMES = 24

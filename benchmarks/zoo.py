@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -66,16 +67,16 @@ def make_entry(name: str, plan: Plan, folder: Path, quick: bool) -> Entry:
     height, width = scene.size
     shrink = PREVIEW / max(height, width)
     save_image(folder / "preview.jpg", scene.render((max(1, round(height * shrink)), max(1, round(width * shrink)))))
-    figures = evaluate(scene, image, labels)
-    edge = figures["ef_psnr"]
+    metrics = evaluate(scene, image, labels)
+    edge = metrics["ef_psnr"]
     entry = Entry(
         name=name, title=plan.title, scene=f"{name}/scene.safetensors", sha256=_hash(folder / "scene.safetensors"),
         bytes=size, recipe=recipe, num_gaussians=scene.num_gaussians,
-        num_regions=1 if scene.regions is None else scene.regions.num_regions, psnr=round(figures["psnr"], 3),
-        ef_psnr=round(edge, 3) if edge == edge else None, licence=plan.licence,
+        num_regions=1 if scene.regions is None else scene.regions.num_regions, psnr=round(metrics["psnr"], 3),
+        ef_psnr=None if math.isnan(edge) else round(edge, 3), licence=plan.licence,
         command=f"python -m benchmarks zoo -o models --only {name}",
     )  # fmt: skip
-    (folder / "card.md").write_text(_card(entry, scene.size, figures["ms_ssim"]), encoding="utf-8")
+    (folder / "card.md").write_text(_card(entry, scene.size, metrics["ms_ssim"]), encoding="utf-8")
     return entry
 
 

@@ -19,7 +19,7 @@ _CLEAR = Path("/proc/self/clear_refs")
 
 @contextmanager
 def threads(count: int) -> Iterator[None]:
-    """Let torch run on so many threads."""
+    """Let torch run on `count` threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:

@@ -1,4 +1,4 @@
-"""Means by method, differences paired by image with their intervals, and the images on which a method is worse."""
+"""Differences between two methods, paired by image, with their intervals, and the images on which a method is worse."""
 
 from __future__ import annotations
 
@@ -13,56 +13,13 @@ from scipy import stats
 from scipy.interpolate import PchipInterpolator
 
 from .run import Row
+from .tables import column_of, format_value, group_by, is_missing, markdown, title
 
-
-class Column(NamedTuple):
-    """A column of rows, as tables show it."""
-
-    title: str
-    format: str
-    tie: float = 0.0
-    """The largest difference that is no difference, where methods are compared."""
-    less_is_better: bool = False
-
-
-# other columns have their own name as the title, and three digits
-COLUMNS = {
-    "n": Column("N", ",.0f"),
-    "target_bytes": Column("target bytes", ",.0f"),
-    "bytes": Column("bytes", ",.0f", 0.5, less_is_better=True),
-    "map_bytes": Column("of these map", ",.0f", 0.5),
-    "regions": Column("regions", ".1f"),
-    "budget": Column("seconds", ",.0f"),
-    "iterations": Column("iterations", ",.0f"),
-    "bpp": Column("bits per pixel", ".3f", 0.0005),
-    "psnr": Column("PSNR", ".2f", 0.005),
-    "ms_ssim": Column("MS-SSIM", ".4f", 0.0001),
-    "ef_psnr": Column("EF-PSNR", ".2f", 0.005),
-    "ssimulacra2": Column("SSIMULACRA2", ".1f", 0.05),
-    "delta_e": Column("deltaE 2000", ".2f", 0.005, less_is_better=True),
-    "butteraugli": Column("butteraugli", ".1f", 0.05, less_is_better=True),
-    "decoded_psnr": Column("PSNR decoded", ".2f", 0.005),
-    "decoded_ef_psnr": Column("EF-PSNR decoded", ".2f", 0.005),
-    "core_seconds": Column("seconds of a core", ".1f", 0.05, less_is_better=True),
-    "iou": Column("IoU", ".2f", 0.005),
-    "good": Column("good", ".0%"),
-    "failed": Column("failed", ".0%", less_is_better=True),
-    "seconds": Column("seconds", "", less_is_better=True),
-    "batch": Column("images in a batch", ",.0f"),
-    "images_per_second": Column("images per second", ""),
-    "forward_ms": Column("forward, ms", "", less_is_better=True),
-    "both_ms": Column("forward and backward, ms", "", less_is_better=True),
-    "captured_forward_ms": Column("forward captured, ms", "", less_is_better=True),
-    "captured_both_ms": Column("both captured, ms", "", less_is_better=True),
-    "flicker": Column("flicker", ".2f", 0.005, less_is_better=True),
-    "steep": Column("steep", "", less_is_better=True),
-    "beyond [0, 1]": Column("beyond [0, 1]", "", less_is_better=True),
-}
-# of the bootstrap
+# samples of the bootstrap
 _NUM_SAMPLES = 10_000
-# in the logarithm of bytes: how far a curve is continued beyond its ends, 5 %
+# a curve is continued so far beyond its ends, in the logarithm of bytes: 5 %
 _CURVE_MARGIN = math.log(1.05)
-# images that a table of losses names
+# number of images that a line of a table of losses names
 _NUM_WORST = 3
 
 
@@ -104,7 +61,7 @@ class Gain(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """Two methods."""
+    """Two methods whose results are compared, image by image."""
 
     first: str
     second: str
@@ -116,7 +73,7 @@ class Comparison(NamedTuple):
             if row["method"] in self and not is_missing(row.get(quantity)):
                 images = values.setdefault(tuple(row.get(name) for name in cases), {})
                 images.setdefault(row["image"], {}).setdefault(row["method"], []).append(row[quantity])
-        column = _column(quantity)
+        column = column_of(quantity)
         gains = {}
         for case, images in values.items():
             differences = {
@@ -127,79 +84,6 @@ class Comparison(NamedTuple):
             if differences:
                 gains[case] = Gain(differences, column.tie, -1 if column.less_is_better else 1)
         return gains
-
-
-def is_missing(value: Any) -> bool:
-    """True where a row has no number."""
-    return not isinstance(value, int | float) or math.isnan(value)
-
-
-def values_of(rows: Iterable[Row], name: str) -> list[float]:
-    """Return the numbers of a column."""
-    return [row[name] for row in rows if not is_missing(row.get(name))]
-
-
-def group_by(rows: Iterable[Row], names: Sequence[str]) -> dict[tuple[object, ...], list[Row]]:
-    """Group rows by their values of these columns, in order of appearance."""
-    groups = defaultdict(list)
-    for row in rows:
-        groups[tuple(row.get(name) for name in names)].append(row)
-    return groups
-
-
-def title(name: str) -> str:
-    """Return the title of a column."""
-    return _column(name).title
-
-
-def format_value(name: str, value: Any, sign: str = "") -> str:
-    """Format a value of a column; a text stays, a missing number is empty."""
-    if isinstance(value, str):
-        return value
-    if is_missing(value):
-        return ""
-    default = ",.0f" if abs(value) >= 100 else ".3g"
-    return format(value, sign + (_column(name).format or default))
-
-
-def _column(name: str) -> Column:
-    return COLUMNS.get(name, Column(name.replace("_", " "), ""))
-
-
-def markdown(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    """Lay out a table."""
-    return "\n".join("| " + " | ".join(row) + " |" for row in [header, ["---"] * len(header), *lines])
-
-
-def means_table(
-    rows: Sequence[Row], names: Sequence[str], along: str, quantities: Sequence[str], sign: str = ""
-) -> str:
-    """Lay out means, a line for each combination of names, a column for each value along, quantities as "a / b".
-
-    A mean of fewer images than others of its line has their number behind it.
-    """
-    values: list[Any] = list(group_by(rows, [along])) if along else [()]
-    lines = []
-    for key, group in group_by(rows, names).items():
-        by_value = group_by(group, [along] if along else [])
-        cells = [_mean_cells(by_value.get(value, []), quantities, sign) for value in values]
-        counts = [len(group_by(by_value.get(value, []), ["image"])) for value in values]
-        joined = [
-            " / ".join(filter(None, cell)) + (f" ({count})" if 0 < count < max(counts) else "")
-            for cell, count in zip(cells, counts, strict=True)
-        ]
-        joined = joined if along else cells[0]
-        lines.append([*map(format_value, names, key), *joined])
-    header = [_column_header(along, *value) for value in values] if along else map(title, quantities)
-    return markdown([*map(title, names), *header], lines)
-
-
-def _column_header(name: str, value: Any) -> str:
-    return value if isinstance(value, str) else f"{title(name)} = {format_value(name, value)}"
-
-
-def _mean_cells(rows: Sequence[Row], quantities: Sequence[str], sign: str) -> list[str]:
-    return [format_value(name, fmean(values), sign) if (values := values_of(rows, name)) else "" for name in quantities]
 
 
 def differences(
@@ -237,11 +121,6 @@ def losses_table(
                 count = sum(len(gain.values) for gain in by_case.values())
                 lines.append([" - ".join(comparison), title(quantity), f"{len(losses)} of {count}", ", ".join(worst)])
     return markdown(["difference", "in", "lost", "worst"], lines) if lines else ""
-
-
-def join_tables(first: str, second: str) -> str:
-    """Put the lines of a table under those of another with the same columns; either may be empty."""
-    return "\n".join([first, *second.splitlines()[2:]]) if first else second
 
 
 def _case(name: str, value: Any) -> str:

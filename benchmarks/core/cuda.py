@@ -28,7 +28,7 @@ def synchronize() -> None:
 
 
 def finish(action: Callable[[], object], calls: int = 1) -> None:
-    """Call so often, and wait for the GPU."""
+    """Call an action `calls` times, then wait for the GPU."""
     for _ in range(calls):
         action()
     synchronize()

@@ -15,13 +15,13 @@ from matplotlib.ticker import LogLocator
 from PIL import Image
 from torch import Tensor
 
-from .compare import group_by, is_missing, title
 from .run import Row
+from .tables import group_by, is_missing, title
 
-# of Okabe and Ito; those of `kcgs.plots` have no public name, and benchmarks import only public names
+# the palette of Okabe and Ito; the one of `kcgs.plots` is not public
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
 MARKERS = "osD^vP"
-# in characters
+# width of a line of the legend, and of the marker of an entry, in characters
 _LEGEND_WIDTH = 125
 _LEGEND_MARKER = 7
 

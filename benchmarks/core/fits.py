@@ -22,7 +22,7 @@ from .images import load_mapped
 from .run import Job, Options, Row
 
 QUICK_ITERATIONS = 10
-# of the short fits that tell how long an iteration takes
+# iterations of the two short fits that measure the time of an iteration
 TRIAL_ITERATIONS = (50, 200)
 # share of the time by which a fit may miss it
 TOLERANCE = 0.12
@@ -30,7 +30,7 @@ TOLERANCE = 0.12
 REPORTED: dict[str, Callable[..., Tensor]] = {"psnr": psnr, "ef_psnr": ef_psnr, "ms_ssim": ms_ssim}
 # a recipe, and arguments of `fit` that differ from it: plain values, or names of `image_gs.OBJECTS`
 Method = tuple[str, dict[str, Any]]
-# that are compared in as much time
+# methods that reports compare in the same time
 METHODS: dict[str, Method] = {
     **{name: (name, {}) for name in ("best", "best-baseline", "paper", "gaussian-image", "gaussian-image-clamp")},
     # SSIM in torch takes ten times as long as all else
@@ -51,14 +51,14 @@ def plan(images: Iterable[str], counts: Sequence[int], methods: dict[str, Method
 def measure_fit(
     image: str, n: int, method: str, recipe: str, settings: dict[str, Any], data: str, quick: bool
 ) -> list[Row]:
-    """Fit and measure."""
+    """Fit an image, and measure the scene and its file."""
     pixels, labels = load_mapped(image, data, quick)
     result, seconds = timed_fit(pixels, labels, n, (recipe, settings))
-    return [{"image": image, "n": n, "method": method, **figures(result, seconds, pixels, labels)}]
+    return [{"image": image, "n": n, "method": method, **measure_result(result, seconds, pixels, labels)}]
 
 
 def timed_fit(image: Tensor, labels: Tensor, n: int, method: Method) -> tuple[FitResult, float]:
-    """Fit, and return the processor time, too; compilation is not in it."""
+    """Fit an image; return the result and its processor time in seconds, without compilation."""
     recipe, settings = method
     objects = {name: image_gs.OBJECTS[value] for name, value in settings.items() if value in image_gs.OBJECTS}
     config = FitConfig.from_recipe(recipe, **{name: settings[name] for name in settings.keys() - objects.keys()})
@@ -69,33 +69,35 @@ def timed_fit(image: Tensor, labels: Tensor, n: int, method: Method) -> tuple[Fi
 
 
 def fit_for(seconds: float, image: Tensor, labels: Tensor, n: int, method: str) -> tuple[FitResult, float]:
-    """Fit for so many seconds of a core: two short fits tell how many iterations that are; a miss is corrected once."""
+    """Fit for about `seconds` of a core: two short fits time an iteration; a fit that misses is repeated."""
     short, long = (timed_fit(image, labels, n, method_of(method, count))[1] for count in TRIAL_ITERATIONS)
     per_iteration = max(long - short, 1e-3) / (TRIAL_ITERATIONS[1] - TRIAL_ITERATIONS[0])
     iterations = max(1, round(TRIAL_ITERATIONS[0] + (seconds - short) / per_iteration))
-    result, needed = timed_fit(image, labels, n, method_of(method, iterations))
-    if abs(needed / seconds - 1) > TOLERANCE:
-        result, needed = timed_fit(image, labels, n, method_of(method, max(1, round(iterations * seconds / needed))))
-    return result, needed
+    result, elapsed = timed_fit(image, labels, n, method_of(method, iterations))
+    if abs(elapsed / seconds - 1) > TOLERANCE:
+        iterations = max(1, round(iterations * seconds / elapsed))
+        result, elapsed = timed_fit(image, labels, n, method_of(method, iterations))
+    return result, elapsed
 
 
 def method_of(name: str, iterations: int | None) -> Method:
-    """Return one of METHODS for so many iterations, None: its own."""
+    """Return one of METHODS with this number of iterations, or with its own number for None."""
     recipe, settings = METHODS[name]
     return recipe, settings if iterations is None else {**settings, "iterations": iterations}
 
 
-def figures(result: FitResult, seconds: float, image: Tensor, labels: Tensor) -> Row:
+def measure_result(result: FitResult, seconds: float, image: Tensor, labels: Tensor) -> Row:
     """Measure a fitted scene and its file."""
     scene, regions = result.scene, result.scene.regions
     with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # NaN: too small for MS-SSIM
-        own = evaluate(scene, image, labels)
-    file = encode(scene, quality=quality_for(own["psnr"]))
+        metrics = evaluate(scene, image, labels)
+    file = encode(scene, quality=quality_for(metrics["psnr"]))
     decoded = measure_render(decode(file).scene.render(), image, labels)
     contours = None if regions is None or regions.num_regions == 1 else regions.labels
     return {
-        "iterations": result.history[-1].iteration, "core_seconds": seconds, **{name: own[name] for name in REPORTED},
-        "ssimulacra2": own.get("ssimulacra2", math.nan), "bytes": len(file), "bpp": 8 * len(file) / image[0].numel(),
+        "iterations": result.history[-1].iteration, "core_seconds": seconds,
+        **{name: metrics[name] for name in REPORTED}, "ssimulacra2": metrics.get("ssimulacra2", math.nan),
+        "bytes": len(file), "bpp": 8 * len(file) / image[0].numel(),
         "map_bytes": 0 if contours is None else len(encode_labels(contours)),
         **{f"decoded_{name}": value for name, value in decoded.items()},
     }  # fmt: skip
@@ -104,9 +106,7 @@ def figures(result: FitResult, seconds: float, image: Tensor, labels: Tensor) ->
 def measure_render(render: Tensor, image: Tensor, labels: Tensor | None) -> Row:
     """Return the metrics of a render; those of contours where there are labels."""
     row: Row = {}
-    with warnings.catch_warnings():
-        # NaN: the image is too small for MS-SSIM
-        warnings.simplefilter("ignore", RuntimeWarning)
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # NaN: too small for MS-SSIM
         for name, metric in REPORTED.items():
             if not name.startswith("ef_"):
                 row[name] = float(metric(render, image))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from .compare import format_value, markdown, title
+from .tables import format_value, markdown, title
 
 
 class Goal(NamedTuple):
@@ -24,7 +24,7 @@ class Goal(NamedTuple):
 
 
 def goals_table(goals: Sequence[Goal]) -> str:
-    """Lay out goals and what was measured."""
+    """Lay out goals and what was measured, under a heading; "" where there are no goals."""
     lines = []
     for goal in goals:
         limit, measured = (format_value(goal.quantity, value) for value in (goal.limit, goal.measured))
@@ -32,7 +32,7 @@ def goals_table(goals: Sequence[Goal]) -> str:
         lines.append(
             [goal.case, title(goal.quantity), f"{'>=' if goal.more_is_better else '<='} {limit}", measured, verb]
         )
-    return markdown(["case", "quantity", "goal", "measured", ""], lines)
+    return f"Goals:\n\n{markdown(['case', 'quantity', 'goal', 'measured', ''], lines)}" if lines else ""
 
 
 def missed_goals(goals: Sequence[Goal]) -> str:

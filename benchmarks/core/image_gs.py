@@ -30,7 +30,7 @@ _OVERLAP = math.pi / 2
 # pixels: thinner Gaussians would fall between the pixel centres, at the start and in the descent
 _MIN_FIRST_SIGMA = 0.5
 _MIN_SIGMA = 0.1
-# of 1 - SSIM beside the mean absolute error
+# weight of 1 - SSIM in the loss; the mean absolute error has the weight 1
 _SSIM_WEIGHT = 0.1
 
 

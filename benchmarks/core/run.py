@@ -27,7 +27,7 @@ Job = dict[str, Any]
 Measure = Callable[..., list[Row]]
 RESULTS_FILE = "results.csv"
 DIFFERENCES_FILE = "differences.csv"
-# the command, the tree of kcgs, the machine and a note on what is missing
+# holds the command, the tree of kcgs, the machine, and a note if jobs are missing
 RUN_FILE = "run.json"
 QUICK_NOTE = "This is the short form, with small images and few iterations: it only shows that all of it runs."
 
@@ -43,13 +43,13 @@ class Options(NamedTuple):
     redraw: bool = False
 
     def folder(self) -> Path:
-        """Return the folder of the data; a ValueError: none was given."""
+        """Return the folder of the data; raise a ValueError if there is none."""
         if self.data is None:
             raise ValueError("data must be a folder with images; got None")
         return self.data
 
     def image_arguments(self) -> dict[str, Any]:
-        """Return arguments of `images.load` in the form of a job, which JSON can hold."""
+        """Return arguments of `images.load` as values that JSON can hold."""
         return {"data": str(self.data or ""), "quick": self.quick}
 
 
