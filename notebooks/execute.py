@@ -51,7 +51,10 @@ def execute(path: Path, *, quick: bool, timeout: float = 600.0) -> NotebookNode:
             resources={"metadata": {"path": folder}},
             extra_arguments=["--IPKernelApp.log_level=ERROR"],
         )
-        client.execute(env={**os.environ, **_ENVIRONMENT, "KCGS_QUICK": str(int(quick)), "IPYTHONDIR": folder})
+        # the notebook imports `show.py`, as it does where it lies
+        python_path = os.pathsep.join(filter(None, [str(FOLDER), os.environ.get("PYTHONPATH")]))
+        settings = {"KCGS_QUICK": str(int(quick)), "IPYTHONDIR": folder, "PYTHONPATH": python_path}
+        client.execute(env={**os.environ, **_ENVIRONMENT, **settings})
     _drop_what_varies(notebook)
     for cell in notebook.cells:
         for output in cell.get("outputs", []):
