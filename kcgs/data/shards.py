@@ -67,7 +67,8 @@ class SceneDataset(Dataset[Scene]):
 
     Raises:
         FileNotFoundError: no shards there.
-        ValueError: a file that is no shard, or shards that differ in rows or channels.
+        ValueError: a file that is no shard, or without a name and a PSNR for each scene; shards that differ in rows or
+            channels.
 
     Example:
         >>> import tempfile
@@ -95,7 +96,13 @@ class SceneDataset(Dataset[Scene]):
         self.names, psnrs, counts = [], [], []
         for number in range(len(self._paths)):
             names, psnr = shard_contents(self._shard(number).metadata, self._paths[number])
-            counts.append(len(names))
+            count = len(self._shard(number).tensors["means"])
+            if not len(names) == len(psnr) == count:
+                raise ValueError(
+                    f"{self._paths[number]} must have a name and a PSNR for each of its {count} scenes; "
+                    f"got {len(names)} names and {len(psnr)} PSNRs"
+                )
+            counts.append(count)
             self.names += names
             psnrs += psnr
         self.psnr = torch.tensor(psnrs, dtype=torch.float64)
@@ -152,12 +159,13 @@ class SceneDataset(Dataset[Scene]):
 
 
 def list_shards(folder: str | os.PathLike[str]) -> list[Path]:
-    """List the shards of a folder, in order."""
-    return sorted(path for path in Path(folder).glob("*.safetensors") if _is_shard(path))
+    """List the shards of a folder, in the order of their numbers."""
+    paths = [path for path in Path(folder).glob("*.safetensors") if _is_shard(path)]
+    return sorted(paths, key=lambda path: int(path.stem))
 
 
 def _is_shard(path: Path) -> bool:
-    return path.suffix == ".safetensors" and path.stem.isdigit() and len(path.stem) >= _DIGITS
+    return path.suffix == ".safetensors" and path.stem.isdecimal() and len(path.stem) >= _DIGITS
 
 
 def shard_path(folder: Path, number: int) -> Path:
@@ -168,7 +176,7 @@ def shard_path(folder: Path, number: int) -> Path:
 def save_shard(
     path: str | os.PathLike[str],
     scenes: Scene,
-    names: Sequence[str],
+    names: Sequence[str | Path],
     psnr: Sequence[float] | Tensor,
     metadata: Mapping[str, str] | None = None,
 ) -> int:
@@ -177,7 +185,7 @@ def save_shard(
     Args:
         path: 00000.safetensors, 00001.safetensors and so on.
         scenes: a batch of images of one size; opacities are merged into the colours.
-        names: of the images.
+        names: of the images; paths are written as text.
         psnr: of the scenes, in dB, such as `psnr` of :class:`kcgs.FitResult`.
         metadata: notes for the file, besides those of the scenes.
 
@@ -203,7 +211,7 @@ def save_shard(
         raise InvalidArgument("psnr", "numbers of dB", numbers)
     # JSON has no infinity, the PSNR of an image without error
     finite = [None if number == math.inf else number for number in numbers]
-    notes = {**scenes.metadata, **(metadata or {}), "names": json.dumps([*names]), "psnr": json.dumps(finite)}
+    notes = {**scenes.metadata, **(metadata or {}), "names": json.dumps([*map(str, names)]), "psnr": json.dumps(finite)}
     field = scenes.field
     field = GaussianField(field.means, field.cholesky, field.merged_colors(), field.region_ids, size=field.size)
     return Scene(field, scenes.regions, notes).save(path)

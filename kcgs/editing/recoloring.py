@@ -111,6 +111,8 @@ def _paint(scene: Scene, region_id: int, color: str | Numbers, strength: float) 
     """Give a region a share of a colour times a linear function of the luma; see `recolor_region`."""
     if scene.regions is None:
         raise InvalidArgument("scene", "a label map", "none", verb="have")
+    if scene.regions.is_resampled:
+        raise ValueError("scene must not have a resized map: recolour the scene at its own size, then resize the map")
     pixels = scene.regions.labels == region_id
     if not pixels.any():
         raise InvalidArgument("region_ids", "of regions with pixels in the map", region_id)

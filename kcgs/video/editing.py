@@ -17,7 +17,7 @@ from kcgs.scene import Scene, check_batch
 
 from .background import affine_motions, apply_affine, restore_background
 from .descent import FrameDescent
-from .stacking import stack
+from .stacking import clear_lost_rows, stack
 
 
 @torch.inference_mode(False)
@@ -109,7 +109,9 @@ def move_in_video(scenes: Scene, region_ids: int | Iterable[int], offset: Sequen
     region_field = GaussianField(means, field.cholesky[:, rows], colors, row_ids[:, rows], size=scenes.size)
     labels = shift_labels(regions.labels, torch.isin(regions.labels, ids), steps, background.regions.labels)[1]
     warn_of_lost_regions(regions, labels)
-    return Scene(join(background.field, region_field), regions.relabel(labels, "mean"), scenes.metadata)
+    new_regions = regions.relabel(labels, "mean")
+    gaussians = clear_lost_rows(Gaussians.of(join(background.field, region_field)), new_regions)
+    return Scene(gaussians.field(scenes.size), new_regions, scenes.metadata)
 
 
 def _check(scenes: Scene, region_ids: int | Iterable[int]) -> tuple[RegionMap, Tensor, Tensor]:

@@ -25,7 +25,7 @@ from kcgs.scene import Scene
 from .descent import FrameDescent, renderer_of
 from .files import DEFAULT_FRAME_RATE
 from .flow import move_labels, move_points, optical_flow
-from .stacking import stack
+from .stacking import clear_lost_rows, stack
 
 OnFrame = Callable[[int, Scene], bool | None]
 Labels = RegionMap | Tensor | NDArray[Any]
@@ -86,7 +86,7 @@ def fit_video(
     Raises:
         TypeError: wrong types.
         ValueError: as :func:`kcgs.fit`; an objective that is neither l2 nor ms-ssim, such as a recipe's; `bounded`; no
-            frames; a frame of another size, or without a label map.
+            frames; a frame of another size; as many label maps as frames are wanted, or one.
 
     Example:
         >>> frames = [torch.zeros(3, 16, 24) for _ in range(3)]
@@ -174,18 +174,15 @@ class _VideoFit:
 
         A pixel changed if the unmoved Gaussians have a larger error around it than when they were fitted.
         """
-        means, cholesky, colors, region_ids = Gaussians.of(self.frames[-1].field)
-        if regions is not None and region_ids is not None:  # rows of lost regions become unused
-            is_present = torch.isin(region_ids, regions.ids)
-            region_ids = torch.where(is_present, region_ids, regions.ids[0])
-            colors = torch.where(is_present[:, None], colors, 0.0)
-        still = Gaussians(means, cholesky, colors, region_ids)
+        still = Gaussians.of(self.frames[-1].field)
+        if regions is not None:
+            still = clear_lost_rows(still, regions)
         renderer = renderer_of(self.frames[-1], self.config)._replace(regions=regions)
         error = renderer.squared_error(still, self.image)
         changed_pixels = _local_mean(error) > _MAX_GROWTH * _local_mean(self.error) + _LEVEL
         _, sums = renderer.weight_sums(still)
         movable_rows = sums(changed_pixels[None].to(flow)) >= _MOVABLE_SHARE * sums(torch.ones_like(flow[:1]))
-        means = torch.where(movable_rows[:, None], _move_means(flow, still, regions), means)
+        means = torch.where(movable_rows[:, None], _move_means(flow, still, regions), still.means)
         moved = still._replace(means=means).field(renderer.size)
         return Scene(moved, regions), movable_rows, changed_pixels
 
@@ -210,14 +207,17 @@ def _move_means(flow: Tensor, gaussians: Gaussians, regions: RegionMap | None) -
 def _pair(frames: Iterable[Any], label_maps: Labels | Iterable[Labels] | None) -> Iterator[tuple[Any, Labels | None]]:
     """Yield each frame with its label map, or with None: after a single map, or if there are no maps."""
     maps: Iterator[Labels | None]
+    expected = "label_maps must have a map for each frame, or be one map; got"
     if label_maps is None:
         maps = repeat(None)
     elif isinstance(label_maps, RegionMap) or (isinstance(label_maps, Tensor | np.ndarray) and label_maps.ndim == 2):
         maps = chain([label_maps], repeat(None))
     else:
+        if isinstance(frames, Sized) and isinstance(label_maps, Sized) and len(label_maps) != len(frames):
+            raise ValueError(f"{expected} {len(label_maps)} for {len(frames)} frames")
         maps = iter(label_maps)
     for number, frame in enumerate(frames):
         try:
             yield frame, next(maps)
         except StopIteration:
-            raise ValueError(f"label_maps must have a map for each frame, or be one map; got {number}") from None
+            raise ValueError(f"{expected} {number}") from None

@@ -136,6 +136,9 @@ def test_what_is_no_data_set(tmp_path: Path) -> None:
         save_shard(tmp_path / "train.safetensors", scenes_of(2), "ab", [1.0, 2.0])
     with pytest.raises(ValueError, match="names must be one for each of 2 scenes; got 3"):
         save_shard(tmp_path / "00002.safetensors", scenes_of(2), "abc", [1.0, 2.0])
+    Scene(scenes_of(2).field, None, {"names": '["a"]', "psnr": "[1.0]"}).save(tmp_path / "00000.safetensors")
+    with pytest.raises(ValueError, match="name and a PSNR for each of its 2 scenes; got 1 names and 1 PSNRs"):
+        SceneDataset(tmp_path)
     with pytest.raises(ValueError, match=r"psnr must be numbers of dB; got \[1.0, nan\]"):
         save_shard(tmp_path / "00002.safetensors", scenes_of(2), "ab", [1.0, torch.nan])
     with pytest.raises(TypeError, match="scenes must be a batch of scenes; got list"):
@@ -146,6 +149,12 @@ def test_an_image_without_error(tmp_path: Path) -> None:
     save_shard(tmp_path / "00000.safetensors", scenes_of(2), "ab", torch.tensor([20.0, torch.inf]))
     assert SceneDataset(tmp_path).psnr.tolist() == [20.0, torch.inf]
     assert load(tmp_path / "00000.safetensors").metadata["psnr"] == "[20.0, null]"
+
+
+def test_shards_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    for number in (99_999, 100_000):
+        save_shard(tmp_path / f"{number}.safetensors", scenes_of(1), [Path(f"{number}.jpg")], [20.0])
+    assert SceneDataset(tmp_path).names == ["99999.jpg", "100000.jpg"]
 
 
 def test_notes_of_the_scenes_and_of_the_file(tmp_path: Path) -> None:

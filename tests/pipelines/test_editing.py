@@ -136,6 +136,7 @@ class TestEditing(BaseTester):
                 ValueError,
                 "region_ids must be of regions with pixels in the map; got",
             ),
+            (lambda s: recolor_region(scene_of(RESIZED), BOX, color="red"), ValueError, "must not have a resized map"),
             (lambda s: move_region(scene_of(RESIZED), BOX, (2, 0)), ValueError, "must not have a resized map"),
             (lambda s: render_region(s, BOX, (0, 4)), ValueError, "size must be at least 1 x 1"),
             (lambda s: render_region(Scene(GaussianField.random(3, SIZE), s.regions), BOX), ValueError, "region ids"),

@@ -103,7 +103,8 @@ class TestFitVideo:
         ("frames", "maps", "match"),
         [
             ([], None, "frames must hold at least one frame; got none"),
-            (FRAMES, MAPS[:1], "label_maps must have a map for each frame, or be one map; got 1"),
+            (FRAMES, MAPS[:1], "label_maps must have a map for each frame, or be one map; got 1 for 5 frames"),
+            (iter(FRAMES), iter(MAPS[:1]), "label_maps must have a map for each frame, or be one map; got 1"),
             ([FRAMES[0], FRAMES[0][:, :24]], None, r"frame 1 must have shape \(3, 48, 64\); got \(3, 24, 64\)"),
         ],
     )
@@ -167,7 +168,8 @@ class TestEdits:
         assert moved.regions[2].softness == image.regions.softness
         for move, each in ((move_in_video, scenes), (move_region, scenes[2])):
             with pytest.warns(UserWarning, match="regions 7 are lost: covered, or out of the image"):
-                move(each, 7, (100, 0))
+                moved = move(each, 7, (100, 0))
+            moved.render()  # without a warning of rows whose region has no pixels
 
     def test_recolor(self, scenes: Scene) -> None:
         """All frames at once: the disc of each gets the same gain and bias."""
