@@ -86,9 +86,9 @@ def fit_all(images: Tensor, n: int, config: FitConfig, together: bool) -> Tensor
     return torch.cat([torch.as_tensor(result.psnr) for result in results])
 
 
-def fit_by_name(case: str, batch: int, data: str, quick: bool, config: FitConfig) -> None:
+def fit_by_name(case: str, batch: int, data: str, config: FitConfig) -> None:
     """Fit a batch in a process whose memory is measured."""
-    fit_all(crops(case, batch, data, quick), CASES[case][0], config, together=True)
+    fit_all(crops(case, batch, data, quick=False), CASES[case][0], config, together=True)
 
 
 def measure(image: str, method: str, batches: list[int], data: str, quick: bool) -> list[Row]:
@@ -119,11 +119,12 @@ def measure(image: str, method: str, batches: list[int], data: str, quick: bool)
             }
         )  # fmt: skip
     largest = max(batches)
-    rows[-1]["peak_MB"] = (
-        megabytes(lambda: fit_all(images[largest], n, config, together=True))
-        if method == GPU
-        else peak_megabytes(fit_by_name, image, largest, data, quick, config, warm_up=(image, 2, data, quick, config))
-    )
+    if method == GPU:
+        rows[-1]["peak_MB"] = megabytes(lambda: fit_all(images[largest], n, config, together=True))
+    elif not quick:
+        rows[-1]["peak_MB"] = peak_megabytes(
+            fit_by_name, image, largest, data, config, warm_up=(image, 2, data, config)
+        )
     return rows
 
 

@@ -99,10 +99,11 @@ def jobs(options: Options) -> list[Job]:
     """List the timings of decoders, for workloads and fitted scenes."""
     scenes = [f"{name} {contours}" for name in ("W1", "W2") for contours in ("none", "hard", "soft")]
     scenes = ["W3 hard"] if options.quick else [*scenes, *(f"{name} soft" for name in FITTED)]
+    sizes, counts = (SIZES[:1], (1,)) if options.quick else (SIZES, (1, 2))
     return [
         {"image": scene, "size": size, "count": count, "rounds": 1 if options.quick else ROUNDS,
          "cutoffs": CUTOFFS if size == "native" and count == 1 and not scene.endswith("none") else (DEFAULT_CUTOFF,)}
-        for scene in scenes for size in SIZES[: 1 if options.quick else None] for count in (1, 2)
+        for scene in scenes for size in sizes for count in counts
     ]  # fmt: skip
 
 
