@@ -5,6 +5,7 @@ from __future__ import annotations
 import onnx
 
 from kcgs._check import check_cutoff
+from kcgs.functional import check_values
 from kcgs.scene import Scene, check_scene
 
 from .axis import Axis, make_axis
@@ -44,7 +45,8 @@ def scene_decoder(
 
     Raises:
         TypeError: wrong types.
-        ValueError: a batch, regions of another size or without region ids, a number out of range.
+        ValueError: a batch, regions of another size or without region ids, a number out of range, values that are not
+            finite.
 
     Example:
         >>> import numpy as np, onnxruntime
@@ -58,7 +60,9 @@ def scene_decoder(
     if regions is not None and regions.is_resampled:
         raise ValueError("scene must have the map itself; got one that was resized")
     cutoff = check_cutoff(cutoff)
-    plan = plan_decoder(scene.field, regions, cutoff)
+    field = scene.field
+    check_values(*(values.detach().float() for values in (field.means, field.cholesky, field.merged_colors())))
+    plan = plan_decoder(field, regions, cutoff)
 
     g = Graph()
     down, across, visible = _inputs(g, scene, interactive)

@@ -310,6 +310,12 @@ def resized() -> Scene:
     return scattered(5, (40, 60), regions)
 
 
+def with_value(table: str, value: float) -> Scene:
+    scene = scattered(5, (20, 30))
+    getattr(scene.field, table).data[2, 0] = value
+    return scene
+
+
 class TestBadInput:
     @pytest.mark.parametrize(
         ("make", "options", "message"),
@@ -320,6 +326,9 @@ class TestBadInput:
             (lambda: Scene(scattered(5, (20, 30)).field, torch.zeros(20, 30).long()), {}, "scene must have region ids"),
             (resized, {}, "resized"),
             (batch, {}, "scene must be of one image; got a batch of"),
+            (lambda: with_value("means", float("nan")), {}, "means must be finite"),
+            (lambda: with_value("cholesky", -1.0), {}, "cholesky must be finite, l11 and l22 in"),
+            (lambda: with_value("colors", float("inf")), {}, "colors must be finite"),
         ],
     )
     def test_says_what_is_wrong(self, make: Callable[[], Any], options: dict[str, Any], message: str) -> None:
