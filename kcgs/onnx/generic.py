@@ -9,7 +9,7 @@ import torch
 from kcgs._check import check_cutoff
 from kcgs.kernels import least_whitened, support_radius, whiten
 
-from .graph import BOOL, FLOAT, INT64, Graph, Value
+from .graph import FLOAT, INT64, Graph, Value
 from .metadata import decoder_metadata, image_doc
 from .weights import ROOT, weigh
 
@@ -23,7 +23,7 @@ def generic_decoder(*, cutoff: float = 1e-4, clamp: bool = True) -> onnx.ModelPr
 
     Convention: inputs are ``means`` float32 :math:`(N, 2)` and ``cholesky`` float32 :math:`(N, 3)` in pixels;
     ``colors`` float32 :math:`(N, C)`, multiplied by the opacities; ``region_ids`` int64 :math:`(N)`, indices from 0 to
-    R - 1; and ``memberships`` float32 :math:`(R, H, W)`, the share of each region in each pixel, 0 or 1 for hard
+    R - 1, or -1 where a Gaussian paints nothing; and ``memberships`` float32 :math:`(R, H, W)`, the share of each region in each pixel, 0 or 1 for hard
     contours. Without regions, pass ones of shape :math:`(1, H, W)`, and zeros as ids. The output is ``image`` float32
     :math:`(1, C, H, W)`. All sizes vary. No operator scatters. Memory holds the image, and 1,024 weights for each
     Gaussian on a tile.
@@ -54,20 +54,20 @@ def generic_decoder(*, cutoff: float = 1e-4, clamp: bool = True) -> onnx.ModelPr
     factors = "l11, l21, l22 of the Cholesky factors of the covariances, in pixels; l11, l22 > 0"
     cholesky = g.input("cholesky", FLOAT, ["N", 3], factors)
     colors = g.input("colors", FLOAT, ["N", "C"], "colours, 0 black to 1 white, times opacity; any sign")
-    ids = g.input("region_ids", INT64, ["N"], "region of each Gaussian, 0 to R - 1")
+    ids = g.input("region_ids", INT64, ["N"], "region of each Gaussian, 0 to R - 1; -1: none")
     memberships = g.input("memberships", FLOAT, ["R", "H", "W"], "how much of each pixel is each region's, 0 to 1")
 
     size = g.Shape(memberships, start=1)
     tiles = (size + (_SIDE - 1)) // _SIDE  # down, across
-    memberships = g.Pad(memberships, g.Concat([0] * 4, tiles * _SIDE - size, axis=0))
+    # the last region, which the id -1 reads, has no pixels
+    memberships = g.Pad(memberships, g.Concat([0, 0, 0, 1], tiles * _SIDE - size, axis=0))
     l11, l21, l22 = g.split(cholesky, 3, axis=1)
     frame = g.Concat(means, ROOT / l11, l21 / l11, ROOT / l22, axis=1)  # [N, 5]
     columns = g.split(g.Transpose(frame, perm=[1, 0]), 5)  # [1, N]
     numbers, across = g.Range(0, g.Squeeze(g.Shape(ids)), 1), g.Gather(tiles, 1)
     radius = support_radius(cutoff, torch.float32) * ROOT
 
-    def render_tile() -> list[Value]:
-        number, condition = g.input("tile", INT64, []), g.input("more", BOOL, [])
+    def render_tile(number: Value) -> Value:
         corner = g.Concat(g.Reshape(number % across, [1]), g.Reshape(number // across, [1]), axis=0) * _SIDE  # x, y
         begin = corner[g.constant([1, 0])]
         window = g.Slice(memberships, begin, begin + _SIDE, [1, 2])
@@ -86,9 +86,9 @@ def generic_decoder(*, cutoff: float = 1e-4, clamp: bool = True) -> onnx.ModelPr
         z1, z2 = whiten(dx, dy, k1, slope, k2)
         weight = g.Flatten(weigh(g, -(z1 * z1 + z2 * z2), cutoff))
         weight = weight * window[ids[gaussian]]
-        return [g.Identity(condition), g.Transpose(colors[gaussian], perm=[1, 0]) @ weight]
+        return g.Transpose(colors[gaussian], perm=[1, 0]) @ weight
 
-    image = g.Loop(g.ReduceProd(tiles, keepdims=0), np.bool_(True), body=g.body("tiles", render_tile))
+    image = g.loop(g.ReduceProd(tiles, keepdims=0), render_tile)
     side = g.constant([_SIDE])
     channels = g.Shape(colors, start=1)
     image = g.Reshape(image, g.Concat(tiles, channels, side, side, axis=0))

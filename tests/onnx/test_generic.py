@@ -161,6 +161,14 @@ class TestAgainstRenderer:
         assert torch.allclose(image[above], exact[above], rtol=1e-4)
         assert support_radius(cutoff, torch.float32) < 10  # so that both sets are there
 
+    @pytest.mark.filterwarnings("ignore:.* Gaussians paint nothing")
+    @pytest.mark.parametrize("regions", [1, 4])
+    def test_ids_that_the_map_does_not_hold(self, regions: int) -> None:
+        labels = blobs((37, 53), regions)
+        field, regions_map = make_field(60, (37, 53), labels), RegionMap.from_labels(labels)
+        field.region_ids[::2] = 999
+        assert (decode(field, regions_map) - render(field, regions_map)).abs().max() < 1e-3
+
     def test_no_gaussian_gives_black(self) -> None:
         labels = torch.zeros(3, 4, dtype=torch.int64)
         field = make_field(4, (3, 4), labels).subset(torch.zeros(4, dtype=torch.bool))
