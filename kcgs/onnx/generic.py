@@ -21,10 +21,14 @@ _SIDE = 32
 def generic_decoder(*, cutoff: float = 1e-4, clamp: bool = True) -> onnx.ModelProto:
     r"""Build the graph that renders any Gaussians, for example the prediction of a network.
 
-    Convention: inputs are ``means`` float32 :math:`(N, 2)` and ``cholesky`` float32 :math:`(N, 3)` in pixels;
-    ``colors`` float32 :math:`(N, C)`, multiplied by the opacities; ``region_ids`` int64 :math:`(N)`, indices from 0 to
-    R - 1, or -1 where a Gaussian paints nothing; and ``memberships`` float32 :math:`(R, H, W)`, the share of each region in each pixel, 0 or 1 for hard
-    contours. Without regions, pass ones of shape :math:`(1, H, W)`, and zeros as ids. The output is ``image`` float32
+    Convention: the inputs are
+
+    - ``means``, float32 :math:`(N, 2)`, and ``cholesky``, float32 :math:`(N, 3)`, in pixels;
+    - ``colors``, float32 :math:`(N, C)`, multiplied by the opacities;
+    - ``region_ids``, int64 :math:`(N)`: indices from 0 to R - 1, or -1 for a Gaussian that paints nothing;
+    - ``memberships``, float32 :math:`(R, H, W)`: the share of each region in each pixel, 0 or 1 for hard contours.
+
+    Without regions, pass ones of shape :math:`(1, H, W)`, and zeros as ids. The output is ``image``, float32
     :math:`(1, C, H, W)`. All sizes vary. No operator scatters. Memory holds the image, and 1,024 weights for each
     Gaussian on a tile.
 

@@ -10,7 +10,7 @@ from kcgs.onnx.graph import INT64, Graph, Value
 
 
 def run(g: Graph, output: Value, **feeds: int) -> list[int]:
-    session = onnxruntime.InferenceSession(g.close(output, "result", [None]).SerializeToString())
+    session = onnxruntime.InferenceSession(g.close(output, "result", ["n"]).SerializeToString())
     (result,) = session.run(None, {name: np.array([number]) for name, number in feeds.items()})
     assert result.dtype == np.int64
     return list(result)
