@@ -8,12 +8,12 @@ from kcgs._check import check_cutoff
 from kcgs.functional import check_values
 from kcgs.scene import Scene, check_scene
 
-from .axis import Axis, make_axis
+from .axis import Axis
 from .blocks import BlockRenderer
 from .entries import store_entries
 from .graph import FLOAT, INT64, Graph, Value
 from .grids import CoarseGrids
-from .membership import make_membership
+from .membership import MembershipSampler
 from .metadata import image_doc, scene_metadata
 from .plan import plan_decoder
 
@@ -68,7 +68,7 @@ def scene_decoder(
     down, across, visible = _inputs(g, scene, interactive)
     storage = store_entries(g, plan, visible)
     blocks = BlockRenderer(storage, down, across, cutoff)
-    membership = make_membership(storage, down, across)
+    membership = MembershipSampler(storage, down, across) if plan.mixed_tiles else None
     grids = None if storage.table is None else CoarseGrids(storage, storage.table, down, across, cutoff)
     image = _crop(g, blocks.image(membership, grids), down, across)
     if clamp:
@@ -89,13 +89,13 @@ def _inputs(g: Graph, scene: Scene, interactive: bool) -> tuple[Axis, Axis, Valu
     rows, cols = g.split(size, 2)
     height, width = scene.size
     if not interactive:
-        return make_axis(g, rows, height), make_axis(g, cols, width), None
+        return Axis(g, rows, height), Axis(g, cols, width), None
     bounds = f"left, top, right, bottom of the part to render; the whole is 0, 0, {width}, {height}, in pixels"
     view = g.input("view", FLOAT, [4], bounds)
     left, top, right, bottom = g.split(view, 4)
     factors = "factor on each region, 0 hidden to 1 shown; in the order of the metadata's region_ids"
     visible = g.input("visible", FLOAT, [1 if scene.regions is None else scene.regions.num_regions], factors)
-    return make_axis(g, rows, height, (top, bottom)), make_axis(g, cols, width, (left, right)), visible
+    return Axis(g, rows, height, (top, bottom)), Axis(g, cols, width, (left, right)), visible
 
 
 def _crop(g: Graph, image: Value, down: Axis, across: Axis) -> Value:
