@@ -97,7 +97,7 @@ class Axis:
         return g.Relu(1 - g.Abs(position - np.arange(TILE + 2, dtype=np.float32)))
 
     def spline(self) -> Value:
-        """Return the weights of a tile's nodes, two pixels apart, at each block's pixels, (V, pieces, side, NODES).
+        """Return cubic B-splines, the weights of a tile's nodes at each block's pixels, (V, pieces, side, NODES).
 
         Outside the scene the values of its border hold.
         """

@@ -37,16 +37,16 @@ def scene_decoder(
         cutoff: weights below it are skipped, as in :func:`kcgs.functional.region_splat`.
         clamp: clip the image to [0, 1]; False: values may be below 0 and above 1, as in the renderer.
         interactive: add two inputs. ``view``, float32 (4,): left, top, right and bottom of the part of the scene that
-            fills the image, in pixels of the scene. ``visible``, float32 (R,): a factor on the Gaussians of each
-            region, in the order of the map's ids.
+            fills the image, in pixels of the scene; left < right and top < bottom. ``visible``, float32 (R,): a factor
+            on the Gaussians of each region, in the order of the map's ids.
 
     Returns:
         A checked model for `onnx.save`; :func:`describe_decoder` reads its metadata.
 
     Raises:
         TypeError: wrong types.
-        ValueError: a batch, regions of another size or without region ids, a number out of range, values that are not
-            finite.
+        ValueError: a batch; regions of another size, or without region ids; a cutoff out of range; Gaussians that are
+            not finite or out of range.
 
     Example:
         >>> import numpy as np, onnxruntime

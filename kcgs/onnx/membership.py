@@ -28,7 +28,7 @@ class MembershipSampler:
         membership, smooth = tiles.membership, tiles.smooth
         assert membership is not None and smooth is not None
         self.graph = g
-        self.places = Interpolator(down, across, down.sampling(), across.sampling(), WINDOW)
+        self.interpolator = Interpolator(down, across, down.sampling(), across.sampling(), WINDOW)
         self.ratio = 1 / (down.step * across.step)
         make_windows = StoredWindows if smooth.radius > _FARTHEST else BlurredWindows
         self.windows, self.smooth_windows = (make_windows(g, m, tiles, tiles_of) for m in (membership, smooth))
@@ -46,23 +46,23 @@ class MembershipSampler:
 
         `slots`, (T,), are indices among the tiles with K regions; `row` and `col`, (T,), are those of the tiles.
         """
-        g, places = self.graph, self.places
+        g, interpolator = self.graph, self.interpolator
         windows, smooth_windows = (part.unfold(count)[slots] for part in (self.windows, self.smooth_windows))
 
         def pan() -> Value:
-            return places.blocks(windows, row, col, (count, 1))
+            return interpolator.blocks(windows, row, col, (count, 1))
 
         def sample() -> Value:
-            samples = places.blocks(smooth_windows, row, col, (count, 1))
+            samples = interpolator.blocks(smooth_windows, row, col, (count, 1))
             exponent = self.exponent
             if exponent is None:
-                exponent = sharpness(places.blocks(self.variances[count][slots], row, col, (1, 1)), self.ratio)
+                exponent = sharpness(interpolator.blocks(self.variances[count][slots], row, col, (1, 1)), self.ratio)
             return _sharpen(g, samples, exponent)
 
         def cut() -> Value:
             return g.Reshape(g.Slice(windows, [1, 1], [-1, -1], [2, 3]), [0, 1, count, 1, -1])
 
-        return g.choose(places.is_native, cut, lambda: g.choose(places.is_aligned, pan, sample))
+        return g.choose(interpolator.is_native, cut, lambda: g.choose(interpolator.is_aligned, pan, sample))
 
 
 def _sharpen(g: Graph, samples: Value, exponent: Value) -> Value:
