@@ -63,6 +63,11 @@ def _arithmetic(operator: str, reflected: bool = False) -> Callable[[Value, Oper
     return apply
 
 
+def _function(operator: str) -> Callable[[Value], Value]:
+    """Return a method of `Value` that applies an operator to the value."""
+    return lambda self: self.graph.apply(operator, self)
+
+
 class Value:
     """A tensor of a graph; `x[i]` gathers along the first axis.
 
@@ -87,21 +92,10 @@ class Value:
     __mod__ = _arithmetic("Mod")
     __matmul__ = _arithmetic("MatMul")
     clamp_min = _arithmetic("Max")
-
-    def __neg__(self) -> Value:
-        return self.graph.Neg(self)
-
-    def abs(self) -> Value:
-        """Apply Abs."""
-        return self.graph.Abs(self)
-
-    def reciprocal(self) -> Value:
-        """Apply Reciprocal."""
-        return self.graph.Reciprocal(self)
-
-    def sqrt(self) -> Value:
-        """Apply Sqrt."""
-        return self.graph.Sqrt(self)
+    __neg__ = _function("Neg")
+    abs = _function("Abs")
+    reciprocal = _function("Reciprocal")
+    sqrt = _function("Sqrt")
 
     def __getitem__(self, indices: Value) -> Value:
         return self.graph.Gather(self, indices)

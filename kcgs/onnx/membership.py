@@ -11,7 +11,7 @@ from .blur import BlurredWindows, cut_windows
 from .entries import Storage
 from .graph import Graph, Value
 from .tiles import WINDOW
-from .windows import StoredWindows, pack_windows, split_tiles, tile_ids
+from .windows import StoredWindows, pack_windows, tile_ids
 
 # largest reach of a contour, in pixels, whose blur is computed in the graph
 _FARTHEST = 16
@@ -39,7 +39,8 @@ class MembershipSampler:
             self.exponent = sharpness(g.constant(np.array([widths[0] ** 2], np.float32)), self.ratio)
         else:
             width = pack_windows(g, cut_windows(tiles, tile_ids(tiles_of), width_index[0].cpu().numpy()))
-            self.variances = split_tiles(g, tiles_of, g.constant(np.array(widths, np.float32) ** 2)[width])
+            variances = g.constant(np.array(widths, np.float32) ** 2)[width]
+            self.variances = dict(zip(tiles_of, g.split(variances, [*map(len, tiles_of.values())]), strict=True))
 
     def blocks(self, count: int, slots: Value, row: Value, col: Value) -> Value:
         """Sample the memberships in the blocks of tiles with K regions, (T, blocks, K, 1, P), stored by columns.
@@ -66,7 +67,7 @@ class MembershipSampler:
 
 
 def _sharpen(g: Graph, samples: Value, exponent: Value) -> Value:
-    """Raise the samples of each pixel to a power, and normalise them to a sum of 1."""
+    """Raise the samples of each pixel to a power, and normalise them to a sum of 1; docs/method.md has the formula."""
     samples = g.Max(samples, _TINY)
     ratios = samples / g.ReduceMax(samples, [2], keepdims=1)
     powers = g.Exp(g.Log(ratios) * exponent)  # Pow takes four times as long

@@ -42,12 +42,6 @@ def tile_ids(tiles_of: Mapping[int, Integers]) -> Integers:
     return np.concatenate([*tiles_of.values()])
 
 
-def split_tiles(g: Graph, tiles_of: Mapping[int, Integers], values: Value) -> dict[int, Value]:
-    """Split values of all tiles, (T, ...), by the number of regions."""
-    lengths = [len(tiles) for tiles in tiles_of.values()]
-    return dict(zip(tiles_of, g.split(values, lengths), strict=True))
-
-
 def pack_windows(g: Graph, windows: Integers) -> Value:
     """Store integers (T, S, S) of windows by columns."""
     return g.Reshape(pack_runs(g, windows.swapaxes(1, 2).ravel()), windows.shape)
