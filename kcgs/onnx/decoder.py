@@ -104,17 +104,14 @@ def _crop(g: Graph, image: Value, down: Axis, across: Axis) -> Value:
     def crop() -> Value:
         return g.Slice(image, [0, 0], g.Concat(down.size, across.size, axis=0), [2, 3])
 
-    def reduce() -> Value:
+    def select() -> Value:
         rows, columns = down.places(), across.places()
-
-        def shrink() -> Value:
-            return across.shrink(down.shrink(image, rows, 2), columns, 3)
 
         def crop_uneven() -> Value:
             lines = g.Transpose(g.Gather(image, rows, axis=2), perm=[0, 1, 3, 2])
             return g.Transpose(g.Gather(lines, columns, axis=2), perm=[0, 1, 3, 2])
 
-        return g.choose(is_smaller, shrink, crop_uneven)
+        return g.choose(is_smaller, lambda: across.shrink(down.shrink(image, rows, 2), columns, 3), crop_uneven)
 
     is_smaller = g.Or(*(g.Less(axis.output, axis.size) for axis in (down, across)))
-    return g.choose(g.And(g.And(down.is_even(), across.is_even()), g.Not(is_smaller)), crop, reduce)
+    return g.choose(g.And(g.And(down.is_even(), across.is_even()), g.Not(is_smaller)), crop, select)

@@ -9,11 +9,11 @@ import numpy as np
 from kcgs.kernels import Z_LIMIT, affine_coefficients
 from kcgs.maps import TILE
 
-from .graph import FLOAT, Graph, Value
+from .graph import FLOAT, INT32, Graph, Value
 from .groups import Group
 from .packing import pack_flags, pack_integers, pack_runs, pack_sparse
 from .plan import DecoderPlan
-from .tables import NodeTable, Slots, argsort, make_node_table, make_slots
+from .tables import NodeTable, Slots, make_node_table, make_slots
 from .weights import ROOT
 
 
@@ -124,10 +124,10 @@ def _sorted_pairs(g: Graph, plan: DecoderPlan, slots: Slots) -> Value:
     flags = pack_flags(g, is_first)
     owner = g.CumSum(flags, 0) - 1
     path = g.CumSum((pack_sparse(g, gaps) + 1) * (1 - flags), 0)
-    begin = path[argsort(g, flags, int(is_first.sum()), largest=1)]
+    begin = path[g.argsort(flags, [int(is_first.sum())], largest=1).astype(INT32)]
     base = pack_integers(g, tile[is_first]) - begin
     number = path + base[owner]
-    return owner[argsort(g, slots.rank[number], len(tile))]
+    return owner[g.argsort(slots.rank[number], [len(tile)]).astype(INT32)]
 
 
 def _whiten(
