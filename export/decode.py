@@ -32,9 +32,7 @@ except ImportError as missing:
 MAX_SIDE = 1 << 20
 _PIXEL_BYTES = 36  # three numbers, three times: as rendered, clipped, and in levels
 _FORMAT, _VERSION = "kcgs.decoder", "1"
-_FLOAT, _INTEGER = "tensor(float)", "tensor(int64)"
-_OPTIONAL = {"view": _FLOAT, "visible": _FLOAT}
-_INPUTS = {"size": _INTEGER}
+_INPUTS = {"size": "tensor(int64)", "view": "tensor(float)", "visible": "tensor(float)"}  # the first is required
 _COLOR_TYPES = {1: 0, 3: 2, 4: 6}  # of PNG, by number of channels
 
 Array = np.ndarray[Any, Any]
@@ -42,7 +40,7 @@ View = tuple[float, float, float, float]
 
 
 class DecodeError(Exception):
-    """What went wrong, in one line for the person at the terminal."""
+    """An error with a message of one line, which the command prints."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +49,7 @@ class Decoder:
 
     path: Path
     session: onnxruntime.InferenceSession
-    notes: Mapping[str, str]
+    metadata: Mapping[str, str]
     inputs: frozenset[str]
     load_ms: float
 
@@ -70,26 +68,26 @@ def open_decoder(path: Path, providers: Sequence[str], threads: int) -> Decoder:
     try:
         session = onnxruntime.InferenceSession(content, options, providers=list(providers), enable_fallback=0)
     except Exception as error:  # onnxruntime's exceptions share no base of their own
-        raise DecodeError(f"onnxruntime cannot load {path}: {_short(error, 300)}") from error
+        raise DecodeError(f"onnxruntime cannot load {path}: {_shorten(error, 300)}") from error
     load_ms = (time.perf_counter() - start) * 1e3
-    # onnxruntime goes on without a provider that does not start
+    # if a provider does not start, onnxruntime goes on without it
     idle = [name for name in providers if name not in session.get_providers()]
     if idle:
         raise DecodeError(f"--providers: {', '.join(idle)} did not start here; what did: {session.get_providers()}")
     try:
-        notes = session.get_modelmeta().custom_metadata_map
-        return Decoder(path, session, notes, _check_decoder(path, session, notes), load_ms)
-    except UnicodeDecodeError as error:  # names and notes are texts
+        metadata = session.get_modelmeta().custom_metadata_map
+        return Decoder(path, session, metadata, _check_decoder(path, session, metadata), load_ms)
+    except UnicodeDecodeError as error:  # names and metadata are texts
         raise DecodeError(f"{path} is damaged: {error}") from error
 
 
-def _check_decoder(path: Path, session: onnxruntime.InferenceSession, notes: Mapping[str, str]) -> frozenset[str]:
+def _check_decoder(path: Path, session: onnxruntime.InferenceSession, metadata: Mapping[str, str]) -> frozenset[str]:
     for key, value in (("format", _FORMAT), ("format_version", _VERSION)):
-        if notes.get(key) != value:
-            raise DecodeError(f"{path} is not a decoder: {key} must be {value}; got {notes.get(key)!r}")
-    inputs, known = {value.name: value.type for value in session.get_inputs()}, _INPUTS | _OPTIONAL
-    if not _INPUTS.keys() <= inputs.keys() or not inputs.items() <= known.items():
-        raise DecodeError(f"{path} is not a decoder: its inputs must be {known}; got {inputs}")
+        if metadata.get(key) != value:
+            raise DecodeError(f"{path} is not a decoder: {key} must be {value}; got {metadata.get(key)!r}")
+    inputs = {value.name: value.type for value in session.get_inputs()}
+    if "size" not in inputs or not inputs.items() <= _INPUTS.items():
+        raise DecodeError(f"{path} is not a decoder: its inputs must be {_INPUTS}; got {inputs}")
     if [value.name for value in session.get_outputs()] != ["image"]:
         raise DecodeError(f"{path} is not a decoder: its output must be image")
     return frozenset(inputs)
@@ -100,15 +98,15 @@ def run(decoder: Decoder, feeds: Mapping[str, Array], size: tuple[int, int]) -> 
     try:
         image: Array = decoder.session.run(["image"], dict(feeds))[0]
     except Exception as error:  # as above
-        raise DecodeError(f"{decoder.path} failed at {size[1]}x{size[0]}: {_short(error, 300)}") from error
+        raise DecodeError(f"{decoder.path} failed at {size[1]}x{size[0]}: {_shorten(error, 300)}") from error
     if image.ndim != 4 or image.shape[0] != 1 or image.shape[2:] != size:
         raise DecodeError(f"{decoder.path} must give an image of shape (1, C, {size[0]}, {size[1]}); got {image.shape}")
     return np.asarray(image[0])
 
 
 def scene_feeds(decoder: Decoder, args: argparse.Namespace) -> tuple[dict[str, Array], tuple[int, int]]:
-    """Inputs of a scene decoder, and the image's size."""
-    scene_size = _note_side(decoder.path, decoder.notes, "height"), _note_side(decoder.path, decoder.notes, "width")
+    """Return the inputs of a scene decoder, and the size of the image."""
+    scene_size = _read_side(decoder, "height"), _read_side(decoder, "width")
     for option, argument, name in (("--view", args.view, "view"), ("--region", args.region, "visible")):
         if argument is not None and name not in decoder.inputs:
             raise DecodeError(f"{option} needs an interactive decoder, with the input {name}; {decoder.path} has none")
@@ -118,29 +116,29 @@ def scene_feeds(decoder: Decoder, args: argparse.Namespace) -> tuple[dict[str, A
         feeds["view"] = np.array(args.view or (0, 0, scene_size[1], scene_size[0]), np.float32)
     if "visible" in decoder.inputs:
         try:
-            ids = np.array(json.loads(decoder.notes.get("region_ids", "")), np.int64).reshape(-1)
+            ids = np.array(json.loads(decoder.metadata.get("region_ids", "")), np.int64).reshape(-1)
         except (ValueError, TypeError, OverflowError, RecursionError):
             raise DecodeError(f"{decoder.path} is damaged: its region_ids must be a JSON list of integers") from None
-        feeds["visible"] = _chosen(ids, args.region).astype(np.float32)
+        feeds["visible"] = _select_regions(ids, args.region).astype(np.float32)
     return feeds, size
 
 
-def _chosen(ids: Array, wanted: Sequence[int] | None) -> Array:
-    if wanted is None:
+def _select_regions(ids: Array, selected: Sequence[int] | None) -> Array:
+    if selected is None:
         return np.ones(len(ids), bool)
-    for region in wanted:
+    for region in selected:
         if not (ids == region).any():
-            raise DecodeError(f"--region must be among the scene's regions {_short(ids.tolist())}; got {region}")
-    return np.isin(ids, wanted)
+            raise DecodeError(f"--region must be among the scene's regions {_shorten(ids.tolist())}; got {region}")
+    return np.isin(ids, selected)
 
 
 def target_size(args: argparse.Namespace, scene_size: tuple[int, int]) -> tuple[int, int]:
-    """Height and width of the image: as asked, or those of the view at a scale."""
+    """Return height and width of the image: those of --size, or those of the view times the scale."""
     if args.size is not None:
         sides = args.size
     else:
         height, width = (args.view[3] - args.view[1], args.view[2] - args.view[0]) if args.view else scene_size
-        # compared before rounding, which an infinite side has not
+        # limited before the rounding, which raises if a side is infinite
         sides = [min(side * args.scale, MAX_SIDE + 1.0) for side in (height, width)]
         sides = [max(1, round(side)) for side in sides]
     if not all(1 <= side <= MAX_SIDE for side in sides):
@@ -152,10 +150,11 @@ def target_size(args: argparse.Namespace, scene_size: tuple[int, int]) -> tuple[
     return sides[0], sides[1]
 
 
-def _note_side(path: Path, notes: Mapping[str, str], name: str) -> int:
-    text = notes.get(name, "")
+def _read_side(decoder: Decoder, name: str) -> int:
+    text = decoder.metadata.get(name, "")
     if not re.fullmatch("[0-9]{1,8}", text) or not 1 <= int(text) <= MAX_SIDE:
-        raise DecodeError(f"{path}: its {name} must be a whole number of 1 to {MAX_SIDE} pixels; got {_short(text)!r}")
+        expected = f"a whole number of 1 to {MAX_SIDE} pixels"
+        raise DecodeError(f"{decoder.path}: its {name} must be {expected}; got {_shorten(text)!r}")
     return int(text)
 
 
@@ -166,13 +165,13 @@ def _read(path: Path) -> bytes:
         raise DecodeError(f"cannot read {path}: {error.strerror}") from error
 
 
-def _short(value: object, most: int = 80) -> str:
+def _shorten(value: object, most: int = 80) -> str:
     text = " ".join(str(value).split())
     return text if len(text) <= most else text[: most - 3] + "..."
 
 
 def check_output(path: Path) -> None:
-    """Refuse a path that could not be written, before the work."""
+    """Raise an error if a path cannot be written, before the work."""
     if path.suffix not in (".png", ".npy"):
         raise DecodeError(f"-o must end in .png or .npy; got {path}")
     if not path.parent.is_dir():
@@ -182,7 +181,7 @@ def check_output(path: Path) -> None:
 
 
 @contextmanager
-def _whole(path: Path) -> Iterator[Path]:
+def _atomic_path(path: Path) -> Iterator[Path]:
     temporary = path.with_name(f".tmp-{uuid.uuid4().hex}{path.suffix}")
     try:
         yield temporary
@@ -199,7 +198,7 @@ def write_image(path: Path, image: Array) -> None:
         raise DecodeError(f"the decoder gave NaN or infinite values, {(~np.isfinite(image)).sum()} of {image.size}")
     if path.suffix == ".png" and image.shape[0] not in _COLOR_TYPES:
         raise DecodeError(f"a PNG has 1, 3 or 4 channels; got {image.shape[0]}: write a .npy file")
-    with _whole(path) as temporary:
+    with _atomic_path(path) as temporary:
         if path.suffix == ".npy":
             np.save(temporary, image)
         else:
@@ -288,7 +287,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 def decode(args: argparse.Namespace) -> dict[str, object]:
-    """Decode one image, write it, and return what there is to report."""
+    """Decode one image, write it, and return the report that --json prints."""
     check_output(args.output)
     decoder = open_decoder(args.decoder, args.providers, args.threads)
     feeds, size = scene_feeds(decoder, args)
@@ -315,7 +314,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status."""
     args = parse(argv)
     try:
-        with np.errstate(all="ignore"):  # values out of range are refused where they matter
+        with np.errstate(all="ignore"):  # checks raise errors for values out of range
             report = decode(args)
     except (DecodeError, MemoryError, KeyboardInterrupt) as error:
         what = {MemoryError: "not enough memory for this image", KeyboardInterrupt: "interrupted, nothing written"}

@@ -23,6 +23,7 @@ from kcgs.onnx import scene_decoder
 Array = np.ndarray[Any, Any]
 
 SIZE = (20, 34)
+CUTOFF = 1e-4
 # enlarged and reduced, by another factor across than down and no whole one
 OTHER_SIZES = ((24, 41), (11, 17))
 # the view is a cut of the image enlarged ZOOM times, whole pixels of it: (left, top, right, bottom)
@@ -32,15 +33,12 @@ _IRRATIONAL = (2, 3, 5, 7, 11, 13, 17, 19, 23, 29)
 
 
 class Case(NamedTuple):
-    """What a file is made of."""
+    """The map of a scene, and what its Gaussians are."""
 
     ids: tuple[int, ...] = ()
     softness: float | Mapping[tuple[int, int], float] = 0.0
-    channels: int = 3
-    opacities: bool = False
-    needle: bool = False
-    cutoff: float = 1e-4
-    hidden: int = 1  # which of the regions
+    needle: bool = False  # also four channels and opacities
+    hidden: int = 1  # index of the region that `image_visible` hides
 
 
 CASES = {
@@ -48,7 +46,7 @@ CASES = {
     "hard": Case((2, 5, 300)),
     "soft": Case((0, 1, 7), 0.8, hidden=2),
     "pairs": Case((2, 5, 9, 11), {(2, 5): 0.0, (5, 9): 1.7, (2, 9): 0.6, (2, 11): 1.0, (9, 11): 0.4}, hidden=0),
-    "needle": Case((3, 4), channels=4, opacities=True, needle=True),
+    "needle": Case((3, 4), needle=True),
 }
 
 
@@ -76,24 +74,17 @@ def make_scene(case: Case) -> Scene:
     means = uniform(count, 2, 0) * torch.tensor([width + 6.0, height + 6.0]) - 3
     shapes = uniform(count, 3, 2)
     cholesky = (0.4 + 5 * shapes[:, :1] ** 2) * torch.cat([0.4 + shapes[:, 1:], shapes[:, :1] - 0.5], 1)[:, [0, 2, 1]]
-    colors = 0.55 * uniform(count, case.channels, 4) - 0.1
+    colors = 0.55 * uniform(count, 4 if case.needle else 3, 4) - 0.1
     if case.needle:
         means[0], cholesky[0] = torch.tensor([11.3, 6.7]), torch.tensor([24.0, 9.0, 0.3])
     numbers = [t.float() for t in (means, cholesky, colors)]
-    opacities = (0.3 + 0.7 * uniform(count, 1, 7)[:, 0]).float() if case.opacities else None
+    opacities = (0.3 + 0.7 * uniform(count, 1, 7)[:, 0]).float() if case.needle else None
     field = GaussianField(*numbers, opacities=opacities, size=SIZE)
     return Scene(field if regions is None else field.assign_regions(regions), regions)
 
 
-def render(scene: Scene, size: tuple[int, int], cutoff: float, factors: Tensor | None = None) -> Array:
-    """Render by the dense sum in float64, rounded to float32 at the end.
-
-    Args:
-        scene: the Gaussians and their map.
-        size: (height, width).
-        cutoff: weights below it are skipped.
-        factors: on each Gaussian's colour.
-    """
+def render(scene: Scene, size: tuple[int, int], factors: Tensor | None = None) -> Array:
+    """Render by the dense sum in float64, rounded to float32 at the end; `factors`, (N,), multiply the colours."""
     field = scene.field
     colors = field.merged_colors().detach().double()
     means, cholesky = field.means.detach().double(), field.cholesky.detach().double()
@@ -101,7 +92,7 @@ def render(scene: Scene, size: tuple[int, int], cutoff: float, factors: Tensor |
         colors = colors * factors.double()[:, None]
     exact = GaussianField(means, cholesky, colors, field.region_ids, size=field.size)
     with torch.no_grad():
-        image: Tensor = RegionSplatRenderer(cutoff=cutoff, backend="reference")(exact, scene.regions, size)
+        image: Tensor = RegionSplatRenderer(cutoff=CUTOFF, backend="reference")(exact, scene.regions, size)
     return image.float().numpy()
 
 
@@ -111,11 +102,11 @@ def make_arrays(case: Case) -> dict[str, Array]:
     field, regions = scene.field, scene.regions
     tensors = {"means": field.means, "cholesky": field.cholesky, "colors": field.colors, "opacities": field.opacities}
     arrays = {name: tensor.detach().numpy() for name, tensor in tensors.items() if tensor is not None}
-    arrays |= {"height": np.array(SIZE[0]), "width": np.array(SIZE[1]), "cutoff": np.array(case.cutoff)}
+    arrays |= {"height": np.array(SIZE[0]), "width": np.array(SIZE[1]), "cutoff": np.array(CUTOFF)}
     for size in (SIZE, *OTHER_SIZES):
-        arrays[f"image_{size[0]}x{size[1]}"] = render(scene, size, case.cutoff)
+        arrays[f"image_{size[0]}x{size[1]}"] = render(scene, size)
     left, top, right, bottom = CUT
-    large = render(scene, (ZOOM * SIZE[0], ZOOM * SIZE[1]), case.cutoff)
+    large = render(scene, (ZOOM * SIZE[0], ZOOM * SIZE[1]))
     arrays["view"] = np.array(CUT, np.float32) / ZOOM
     arrays["image_view"] = np.ascontiguousarray(large[:, top:bottom, left:right])
     if regions is None or field.region_ids is None:
@@ -132,7 +123,7 @@ def make_arrays(case: Case) -> dict[str, Array]:
     visible[case.hidden] = 0
     arrays["visible"] = visible.numpy()
     factors = visible[regions.index_of(field.region_ids)]
-    arrays["image_visible"] = render(scene, SIZE, case.cutoff, factors)
+    arrays["image_visible"] = render(scene, SIZE, factors)
     return arrays
 
 
@@ -140,7 +131,7 @@ def make(folder: Path) -> None:
     """Write NAME.npz and NAME.onnx of every case into a folder."""
     for name, case in CASES.items():
         np.savez_compressed(folder / f"{name}.npz", **make_arrays(case))
-        model = scene_decoder(make_scene(case), cutoff=case.cutoff, clamp=False, interactive=True)
+        model = scene_decoder(make_scene(case), cutoff=CUTOFF, clamp=False, interactive=True)
         onnx.save(model, folder / f"{name}.onnx")
 
 

@@ -18,6 +18,7 @@ from .metrics import METRICS, ef_psnr, ef_ssim, ms_ssim, psnr, ssim, ssimulacra2
 from .similarity import K1, K2, SCALE_WEIGHTS, SSIM_SIGMA, SSIM_WINDOW, window_mean, window_taps
 from .splat import region_splat, splat_at
 from .tokens import from_tokens, to_tokens
+from .values import check_values
 
 # public; what else is imported here is for the other rooms of kcgs
 __all__ = [

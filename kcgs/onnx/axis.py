@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,7 +16,6 @@ NODES = TILE // 2 + 3
 _PARTS = 1 << 20
 
 
-@dataclass(frozen=True)
 class Axis:
     """Rows, or columns, of the output.
 
@@ -29,21 +27,59 @@ class Axis:
     the whole scene; `shrink` then averages them.
     """
 
-    graph: Graph
-    length: int  # pixels of the scene
-    output: Value  # (1,) int64, pixels of the output
-    size: Value  # (1,) int64, pixels that are rendered
-    parts: Value  # (1,) int64, unit of `local`: parts per pixel of the scene
-    is_native: Value  # (1,) bool, whether pixels are the scene's pixels from its start, and a tile is one block
-    is_aligned: Value  # (1,) bool, whether pixels have the size and the places of the scene's pixels
-    step: Value  # (1,) float32, pixels of the scene per rendered pixel
-    tile: Value  # (V,), consecutive tiles with a run; a constant if the whole scene is rendered
-    runs: Value  # (V,), pixels of each run
-    pieces: Value  # (1,), blocks of a run
-    side: Value  # (1,), pixels of a block
-    local: Value  # (V, pieces, side) int64, pixel centres relative to the corner of the tile, in parts
-    steps: Value  # (side,), pixel centres relative to the middle of a block, where polynomials have least rounding
-    origins: Value  # (V, pieces), middles of blocks relative to the centre of their tile
+    def __init__(self, g: Graph, output: Value, length: int, ends: tuple[Value, Value] | None = None) -> None:
+        """Place `output` pixels, (1,), along a scene of `length` pixels, or the part between `ends`, (1,) each."""
+        self.graph = g
+        self.output = output
+        self.length = length
+        start, extent = _bounds(g, length, ends)
+        # rounded up, with a tolerance for the rounding of the ends; a view far beyond the scene needs no more pixels
+        pixels = (extent + (_PARTS - 1 - _PARTS // 256)) // _PARTS
+        # rendered pixels, (1,)
+        self.size = g.Max(output, g.Min(pixels, 2 * length))
+        # unit of `local`, (1,): parts per pixel of the scene
+        self.parts = self.size * (2 * _PARTS)
+        # pixels of the scene per rendered pixel, (1,) float32
+        self.step = extent.astype(FLOAT) / (self.size * _PARTS).astype(FLOAT)
+        shift = self.size * 2 * start
+        # consecutive tiles with a run, (V,); a constant if the whole scene is rendered
+        self.tile = self._tiles(shift, extent, is_whole=ends is None)
+
+        corner = self.tile * TILE * self.parts
+        # a run begins at the first pixel whose centre is not left of the corner; pixels left of the scene are tile 0's
+        begin = g.Max((corner - shift + extent - 1) // (extent * 2), 0) * g.Min(self.tile, 1)
+        end = g.Concat(g.Slice(begin, [1], [1 << 30], [0]), self.size, axis=0)
+        # pixels of each run, (V,); blocks of a run, (1,); pixels of a block, (1,)
+        self.runs = end - begin
+        longest = g.ReduceMax(self.runs, keepdims=1)
+        self.pieces = (longest + (TILE - 1)) // TILE
+        self.side = (longest + (self.pieces - 1)) // self.pieces
+        # (1,) bool: pixels have the size and the places of the scene's pixels; also, each tile is one block from 0 on
+        self.is_aligned = g.And(g.Equal(start % _PARTS, 0), g.Equal(extent, self.size * _PARTS))
+        self.is_native = g.And(g.And(g.Equal(start, 0), self.is_aligned), g.Equal(self.side, TILE))
+
+        within = g.Range(0, g.Squeeze(self.pieces * self.side), 1)
+        within = g.Reshape(within, g.Concat([1], self.pieces, self.side, axis=0))
+        axes = g.constant([1, 2])
+        pixel = g.Unsqueeze(begin, axes) + within
+        # pixel centres relative to the corner of their tile, in parts, (V, pieces, side)
+        self.local = (pixel * 2 + 1) * extent + (shift - g.Unsqueeze(corner, axes))
+        middle = (self.side - 1).astype(FLOAT) * 0.5
+        # pixel centres relative to the middle of a block, where polynomials have least rounding, (side,)
+        self.steps = (g.Range(0, g.Squeeze(self.side), 1).astype(FLOAT) - middle) * self.step
+        # middles of blocks relative to the centre of their tile, (V, pieces)
+        firsts = g.Gather(self.local, 0, axis=2).astype(FLOAT) / self.parts.astype(FLOAT)
+        self.origins = firsts + (middle * self.step - TILE / 2)
+
+    def _tiles(self, shift: Value, extent: Value, is_whole: bool) -> Value:
+        """Return the tiles from that of the first pixel to that of the last."""
+        g, count = self.graph, -(-self.length // TILE)
+        if is_whole:
+            return g.constant(np.arange(count))
+        centres = (extent + shift, (self.size * 2 - 1) * extent + shift)
+        # clip after the division: Min and Max of onnxruntime 1.31 are wrong for int64 beyond 32 bits
+        first, last = (g.Squeeze(g.Min(g.Max(c // (self.parts * TILE), 0), count - 1)) for c in centres)
+        return g.Range(first, last + 1, 1)
 
     @property
     def padded(self) -> Value:
@@ -61,7 +97,7 @@ class Axis:
         return g.Relu(1 - g.Abs(position - np.arange(TILE + 2, dtype=np.float32)))
 
     def spline(self) -> Value:
-        """Return the weights of a tile's nodes, two pixels apart, at each block's pixels, (V, pieces, side, NODES).
+        """Return cubic B-splines, the weights of a tile's nodes at each block's pixels, (V, pieces, side, NODES).
 
         Outside the scene the values of its border hold.
         """
@@ -104,48 +140,12 @@ class Axis:
         return g.ReduceSum(pixels * shares, [axis + 1], keepdims=0)
 
 
-def make_axis(g: Graph, output: Value, length: int, ends: tuple[Value, Value] | None = None) -> Axis:
-    """Place `output` pixels, (1,), along `length` pixels of the scene, or along the part between `ends`, (1,) each."""
+def _bounds(g: Graph, length: int, ends: tuple[Value, Value] | None) -> tuple[Value, Value]:
+    """Return the start and the length of the part of the scene that is rendered, (1,) each, in parts of a pixel."""
     if ends is None:
-        start, extent = g.constant([0]), g.constant([length * _PARTS])
-    else:
-        start, end = ((bound * _PARTS).astype(INT64) for bound in ends)
-        extent = g.Max(end - start, 1)
-    # rounded up, with a tolerance for the rounding of the ends; a view far beyond the scene needs no more pixels
-    pixels = (extent + (_PARTS - 1 - _PARTS // 256)) // _PARTS
-    size = g.Max(output, g.Min(pixels, 2 * length))
-    parts = size * (2 * _PARTS)
-    step = extent.astype(FLOAT) / (size * _PARTS).astype(FLOAT)
-    shift = size * 2 * start
-    tiles = -(-length // TILE)
-    if ends is None:
-        tile = g.constant(np.arange(tiles))
-    else:
-        centres = (extent + shift, (size * 2 - 1) * extent + shift)  # of the first and the last pixel
-        # clip after the division: Min and Max of onnxruntime 1.31 are wrong for int64 beyond 32 bits
-        first, last = (g.Squeeze(g.Min(g.Max(c // (parts * TILE), 0), tiles - 1)) for c in centres)
-        tile = g.Range(first, last + 1, 1)
-    corner = tile * TILE * parts
-    # a run begins at the first pixel whose centre is not left of the corner; pixels left of the scene belong to tile 0
-    begin = g.Max((corner - shift + extent - 1) // (extent * 2), 0) * g.Min(tile, 1)
-    end = g.Concat(g.Slice(begin, [1], [1 << 30], [0]), size, axis=0)
-    runs = end - begin
-    longest = g.ReduceMax(runs, keepdims=1)
-    pieces = (longest + (TILE - 1)) // TILE
-    side = (longest + (pieces - 1)) // pieces
-    is_aligned = g.And(g.Equal(start % _PARTS, 0), g.Equal(extent, size * _PARTS))
-    is_native = g.And(g.And(g.Equal(start, 0), is_aligned), g.Equal(side, TILE))
-
-    within = g.Reshape(g.Range(0, g.Squeeze(pieces * side), 1), g.Concat([1], pieces, side, axis=0))
-    axes = g.constant([1, 2])
-    pixel = g.Unsqueeze(begin, axes) + within
-    local = (pixel * 2 + 1) * extent + (shift - g.Unsqueeze(corner, axes))
-    middle = (side - 1).astype(FLOAT) * 0.5
-    steps = (g.Range(0, g.Squeeze(side), 1).astype(FLOAT) - middle) * step
-    origins = g.Gather(local, 0, axis=2).astype(FLOAT) / parts.astype(FLOAT) + (middle * step - TILE / 2)
-    return Axis(
-        g, length, output, size, parts, is_native, is_aligned, step, tile, runs, pieces, side, local, steps, origins
-    )
+        return g.constant([0]), g.constant([length * _PARTS])
+    start, end = ((bound * _PARTS).astype(INT64) for bound in ends)
+    return start, g.Max(end - start, 1)
 
 
 class Interpolator:

@@ -48,8 +48,8 @@ class BlurredWindows:
         inside = g.Equal(g.constant(label.astype(np.int32))[pixels], region).astype(FLOAT)
         if isinstance(membership, SmoothMembership):
             taken = g.Equal(g.constant(other.astype(np.int32))[pixels], region).astype(FLOAT)
-            weights = (g.constant(part.astype(np.float32))[pixels] for part in (weight, other_weight))
-            inside = inside * next(weights) + taken * next(weights)
+            weight, other_weight = weight.astype(np.float32), other_weight.astype(np.float32)
+            inside = inside * g.constant(weight)[pixels] + taken * g.constant(other_weight)[pixels]
         # pixels outside the map have no label and no membership
         blurred = blur(inside) / g.Max(blur(g.Less(pixels, np.int32(len(table) - 1))), 1e-30)
         if index is not None:

@@ -9,11 +9,11 @@ import numpy as np
 from kcgs.kernels import Z_LIMIT, affine_coefficients
 from kcgs.maps import TILE
 
-from .graph import FLOAT, Graph, Value
+from .graph import FLOAT, INT32, Graph, Value
 from .groups import Group
 from .packing import pack_flags, pack_integers, pack_runs, pack_sparse
 from .plan import DecoderPlan
-from .tables import NodeTable, Slots, argsort, make_node_table, make_slots
+from .tables import NodeTable, Slots, make_node_table, make_slots
 from .weights import ROOT
 
 
@@ -70,9 +70,13 @@ def store_entries(g: Graph, plan: DecoderPlan, visible: Value | None) -> Storage
     """Store the Gaussians of a plan; unfold all groups' lists at once, since every operator takes time to load."""
     slots = make_slots(g, plan)
     table = None if plan.nodes is None else make_node_table(g, plan.nodes)
-    storage = Storage(g, plan, slots, table, [], visible)
-    if not plan.groups:
-        return storage
+    entries = _unfold_lists(g, plan, slots, table, visible) if plan.groups else []
+    return Storage(g, plan, slots, table, entries, visible)
+
+
+def _unfold_lists(
+    g: Graph, plan: DecoderPlan, slots: Slots, table: NodeTable | None, visible: Value | None
+) -> list[Entries]:
     groups, gaussians = plan.groups, plan.gaussians
     sizes = [len(group.tiles) * group.longest for group in groups]
     begins = [np.arange(size) % group.longest == 0 for size, group in zip(sizes, groups, strict=True)]
@@ -81,12 +85,19 @@ def store_entries(g: Graph, plan: DecoderPlan, visible: Value | None) -> Storage
     squares, polynomials = (g.split(part, sizes) for part in _whiten(g, plan, slots, table, ids, tile))
     colors = g.split(g.constant(gaussians.colors)[ids] * mask, sizes)
     regions = g.split(pack_integers(g, gaussians.region)[ids], sizes)
-    for number, group in enumerate(groups):
-        coefficients = (squares if group.narrow else polynomials)[number]
-        factors = None if group.nodes else visible  # coarse grids are computed on loading, before `visible` is known
-        values = slots.tiles[number], coefficients, colors[number], regions[number], factors
-        storage.entries.append(Entries(g, group, storage.channels, *values))
-    return storage
+    return [
+        Entries(
+            g,
+            group,
+            channels=gaussians.colors.shape[1],
+            tiles=slots.tiles[number],
+            coefficients=(squares if group.narrow else polynomials)[number],
+            colors=colors[number],
+            regions=regions[number],
+            visible=None if group.nodes else visible,  # nodes are evaluated on loading, before `visible` is known
+        )
+        for number, group in enumerate(groups)
+    ]
 
 
 def _list_gaussians(g: Graph, plan: DecoderPlan, slots: Slots, tile: Value, count: int) -> tuple[Value, Value]:
@@ -113,10 +124,10 @@ def _sorted_pairs(g: Graph, plan: DecoderPlan, slots: Slots) -> Value:
     flags = pack_flags(g, is_first)
     owner = g.CumSum(flags, 0) - 1
     path = g.CumSum((pack_sparse(g, gaps) + 1) * (1 - flags), 0)
-    begin = path[argsort(g, flags, int(is_first.sum()), largest=1)]
+    begin = path[g.argsort(flags, [int(is_first.sum())], largest=1).astype(INT32)]
     base = pack_integers(g, tile[is_first]) - begin
     number = path + base[owner]
-    return owner[argsort(g, slots.rank[number], len(tile))]
+    return owner[g.argsort(slots.rank[number], [len(tile)]).astype(INT32)]
 
 
 def _whiten(

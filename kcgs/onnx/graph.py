@@ -1,4 +1,17 @@
-"""Build an ONNX graph by arithmetic on its values, and close it to a checked model."""
+"""A graph of ONNX operators, written as Python expressions.
+
+`Graph` has every operator of ONNX as a method, and `Value` is a tensor that flows through it: arithmetic on values adds
+operators, and arrays and numbers become constants. `close` names the output and returns the checked model:
+
+    >>> graph = Graph()
+    >>> size = graph.input("size", INT64, [2])
+    >>> area = graph.ReduceProd(size * 2, keepdims=0)
+    >>> model = graph.close(area, "area", [])
+    >>> [node.op_type for node in model.graph.node]
+    ['Mul', 'ReduceProd']
+
+`choose` and `loop` add the operators that hold graphs of their own: what their functions build goes into these.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +41,6 @@ Array = NDArray[np.generic]
 @cache
 def _result_dtype(operator: str) -> int | ir.DataType:
     """Return the dtype of an operator's result, or the index of the operand that has this dtype."""
-    if operator in ("If", "Loop"):
-        return FLOAT  # here their branches and turns return parts of an image
     schema = onnx.defs.get_schema(operator, OPSET)
     kind = schema.outputs[0].type_str
     for index, operand in enumerate(schema.inputs):
@@ -45,14 +56,20 @@ def _arithmetic(operator: str, reflected: bool = False) -> Callable[[Value, Oper
 
     def apply(self: Value, other: Operand) -> Value:
         if isinstance(other, int | float):
+            assert isinstance(other, int) or self.dtype == FLOAT, "a float is rounded if the value holds integers"
             other = np.asarray(other, self.dtype.numpy())
         return self.graph.apply(operator, *((other, self) if reflected else (self, other)))
 
     return apply
 
 
+def _function(operator: str) -> Callable[[Value], Value]:
+    """Return a method of `Value` that applies an operator to the value."""
+    return lambda self: self.graph.apply(operator, self)
+
+
 class Value:
-    """A tensor of a graph. Arithmetic adds operators to the graph; `x[i]` gathers along the first axis.
+    """A tensor of a graph; `x[i]` gathers along the first axis.
 
     Python numbers take the dtype of the value. Division of integers rounds towards zero. Methods with torch's names
     allow formulas of `kcgs.maps` and `kcgs.kernels` to take values.
@@ -75,21 +92,10 @@ class Value:
     __mod__ = _arithmetic("Mod")
     __matmul__ = _arithmetic("MatMul")
     clamp_min = _arithmetic("Max")
-
-    def __neg__(self) -> Value:
-        return self.graph.Neg(self)
-
-    def abs(self) -> Value:
-        """Apply Abs."""
-        return self.graph.Abs(self)
-
-    def reciprocal(self) -> Value:
-        """Apply Reciprocal."""
-        return self.graph.Reciprocal(self)
-
-    def sqrt(self) -> Value:
-        """Apply Sqrt."""
-        return self.graph.Sqrt(self)
+    __neg__ = _function("Neg")
+    abs = _function("Abs")
+    reciprocal = _function("Reciprocal")
+    sqrt = _function("Sqrt")
 
     def __getitem__(self, indices: Value) -> Value:
         return self.graph.Gather(self, indices)
@@ -117,13 +123,6 @@ class Graph:
     """A graph under construction: `graph.Gather(x, indices, axis=1)` adds an operator and returns its result.
 
     Arrays become constants; equal arrays are stored once.
-
-    Example:
-        >>> graph = Graph()
-        >>> size = graph.input("size", INT64, [2])
-        >>> model = graph.close(graph.ReduceProd(size * 2, keepdims=0), "area", [])
-        >>> [node.op_type for node in model.graph.node]
-        ['Mul', 'ReduceProd']
     """
 
     def __init__(self) -> None:
@@ -195,15 +194,31 @@ class Graph:
         operands = [numbers.astype(INT64), self.constant(count)]
         return self.add_node("TopK", operands, [INT64, INT64], largest=largest, axis=0)[1]
 
-    def body(self, name: str, build: Callable[[], Sequence[Value]]) -> ir.Graph:
-        """Make the body of a Loop or an If from what `build` adds and returns; it may use values from outside."""
-        self._scopes.append(Scope(Tape(), [], {}))
-        return self._pop(name, build(), {})
-
     def choose(self, condition: Value, first: Callable[[], Value], second: Callable[[], Value]) -> Value:
-        """Compute the first value if a condition, (1,), holds, else the second."""
-        then, other = self.body("then", lambda: [first()]), self.body("else", lambda: [second()])
-        return self.If(condition, then_branch=then, else_branch=other)
+        """Compute the first value if a condition, (1,), holds, else the second, which has the same dtype."""
+        then, dtype = self._body("then", lambda: [first()])
+        other, other_dtype = self._body("else", lambda: [second()])
+        assert dtype == other_dtype
+        return self.add_node("If", [condition], [dtype], then_branch=then, else_branch=other)[0]
+
+    def loop(self, count: Value, turn: Callable[[Value], Value]) -> Value:
+        """Call `turn` with the number of each turn, int64 (), and stack the results of all turns, (count, ...)."""
+
+        def build() -> list[Value]:
+            number, condition = self.input("turn", INT64, []), self.input("more", BOOL, [])
+            return [self.Identity(condition), turn(number)]
+
+        body, dtype = self._body("turns", build)
+        return self.add_node("Loop", [count, self.constant(np.bool_(True))], [dtype], body=body)[0]
+
+    def _body(self, name: str, build: Callable[[], Sequence[Value]]) -> tuple[ir.Graph, ir.DataType]:
+        """Return the graph that `build` adds and returns, and the dtype of its last result.
+
+        The graph may use values from outside.
+        """
+        self._scopes.append(Scope(Tape(), [], {}))
+        results = build()
+        return self._pop(name, results, {}), results[-1].dtype
 
     def close(
         self,

@@ -1,7 +1,7 @@
 """Wide Gaussians: evaluated at the nodes of coarse grids, and interpolated at the pixels by cubic B-splines.
 
 The grids do not depend on the size of the output, so that their nodes are evaluated on loading. The output reads the
-finest grid, whose nodes are two pixels apart. Blocks are stored by columns.
+finest grid, whose nodes are two pixels apart. Blocks are stored by columns. docs/performance.md has the formulas.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from .tables import NodeTable
 from .weights import monomials, weigh
 
 _HALF = TILE // 2
-# weights, in eighths, of the nodes of a coarse grid at a node of the finer grid: node 2 i is between nodes i and i + 1
-# of a window, node 2 i + 1 is at node i + 1
+# weights, in eighths, of the nodes of a coarse grid at a node of the finer grid, as in kcgs/kernels/cpu/spline.py: node
+# 2 i is between nodes i and i + 1 of a window, node 2 i + 1 is at node i + 1
 _REFINE = ((4, 4, 0), (1, 6, 1))
 
 
@@ -33,7 +33,7 @@ class CoarseGrids:
         self.down = down
         self.across = across
         self.down_spline = down.spline()
-        self.places = Interpolator(down, across, self.down_spline, across.spline(), NODES)
+        self.interpolator = Interpolator(down, across, self.down_spline, across.spline(), NODES)
         self.quarters = self._refine(self._evaluate(cutoff))  # [4 n + 1, C, 8, 8], of the finest grid's blocks
 
     def image(self) -> Value:
@@ -48,7 +48,7 @@ class CoarseGrids:
         # [tile column, node, (C, tile row, node)]: one matrix product for each tile column
         values = g.Transpose(values, perm=[1, 3, 2, 0, 4])
         values = g.Reshape(values, g.Concat(g.Shape(self.across.tile), [NODES, -1], axis=0))
-        columns = g.Reshape(self.places.columns, [0, -1, NODES]) @ values
+        columns = g.Reshape(self.interpolator.columns, [0, -1, NODES]) @ values
         columns = g.Transpose(g.Flatten(columns, axis=2), perm=[1, 0])  # [(C, tile row, node), width]
         columns = g.Reshape(columns, g.Concat([channels, -1, NODES], self.across.padded, axis=0))
         return g.Reshape(self.down_spline, [0, -1, NODES]) @ columns
@@ -61,7 +61,7 @@ class CoarseGrids:
         region = g.Min(g.Reshape(regions, [-1]), np.int32(self.table.nodes.no_region))
         windows = self._window(region, g.Reshape(tile, [-1]))
         windows = g.Reshape(windows, g.Concat(g.Shape(regions, end=1), [-1, NODES, NODES], axis=0))
-        return self.places.blocks(windows[slots], row, col, (count, channels))
+        return self.interpolator.blocks(windows[slots], row, col, (count, channels))
 
     def _window(self, region: Value, tile: Value) -> Value:
         """Return the nodes that tiles (n,) read, (n, C, column, row); nodes of hidden regions are zero."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from kcgs.maps import sharpness
@@ -13,7 +11,7 @@ from .blur import BlurredWindows, cut_windows
 from .entries import Storage
 from .graph import Graph, Value
 from .tiles import WINDOW
-from .windows import pack_windows, split_tiles, stored_windows, tile_ids
+from .windows import StoredWindows, pack_windows, tile_ids
 
 # largest reach of a contour, in pixels, whose blur is computed in the graph
 _FARTHEST = 16
@@ -21,77 +19,55 @@ _FARTHEST = 16
 _TINY = 1e-6
 
 
-def make_membership(storage: Storage, down: Axis, across: Axis) -> MembershipSampler | None:
-    """Store the windows of a map; return None if no tile has several regions."""
-    g, tiles, tiles_of = storage.graph, storage.plan.tiles, storage.plan.mixed_tiles
-    membership, smooth = tiles.membership, tiles.smooth
-    if not tiles_of or membership is None or smooth is None:
-        return None
-    places = Interpolator(down, across, down.sampling(), across.sampling(), WINDOW)
-    ratio = 1 / (down.step * across.step)
-    widths, width_index = membership.widths, membership.table.width_index
-    stored = smooth.radius > _FARTHEST
-    windows, smooth_windows = (
-        stored_windows(g, m, tiles, tiles_of) if stored else BlurredWindows(g, m, tiles, tiles_of).unfold
-        for m in (membership, smooth)
-    )
-    if width_index is None:
-        exponent = sharpness(g.constant(np.array([widths[0] ** 2], np.float32)), ratio)
-        return MembershipSampler(g, places, windows, smooth_windows, lambda *_: exponent)
-    width = pack_windows(g, cut_windows(tiles, tile_ids(tiles_of), width_index[0].cpu().numpy()))
-    variances = split_tiles(g, tiles_of, g.constant(np.array(widths, np.float32) ** 2)[width])
-
-    def sample(count: int, slots: Value, row: Value, col: Value) -> Value:
-        return sharpness(places.blocks(variances[count][slots], row, col, (1, 1)), ratio)
-
-    return MembershipSampler(g, places, windows, smooth_windows, sample)
-
-
 class MembershipSampler:
-    """Sample the memberships in the blocks of tiles with several regions, as :class:`kcgs.maps.Resampled` does.
+    """Sample the memberships in the blocks of tiles with several regions, as :class:`kcgs.maps.Resampled` does."""
 
-    Args:
-        g: the graph.
-        places: interpolates windows.
-        windows: returns the memberships of tiles with K regions at the size of the scene, (T, K, S, S).
-        smooth_windows: returns the weights that are interpolated for other sizes.
-        exponent: returns the exponent of the samples in the blocks of tiles.
-    """
-
-    def __init__(
-        self,
-        g: Graph,
-        places: Interpolator,
-        windows: Callable[[int], Value],
-        smooth_windows: Callable[[int], Value],
-        exponent: Callable[[int, Value, Value, Value], Value],
-    ) -> None:
-        self.graph, self.places, self.exponent = g, places, exponent
-        self.windows, self.smooth_windows = windows, smooth_windows
+    def __init__(self, storage: Storage, down: Axis, across: Axis) -> None:
+        """Store the windows of a map with tiles of several regions: at the size of the scene, and for other sizes."""
+        g, tiles, tiles_of = storage.graph, storage.plan.tiles, storage.plan.mixed_tiles
+        membership, smooth = tiles.membership, tiles.smooth
+        assert membership is not None and smooth is not None
+        self.graph = g
+        self.interpolator = Interpolator(down, across, down.sampling(), across.sampling(), WINDOW)
+        self.ratio = 1 / (down.step * across.step)
+        make_windows = StoredWindows if smooth.radius > _FARTHEST else BlurredWindows
+        self.windows, self.smooth_windows = (make_windows(g, m, tiles, tiles_of) for m in (membership, smooth))
+        widths, width_index = membership.widths, membership.table.width_index
+        self.exponent: Value | None = None  # of all pixels; None: `variances` of pixels by the number of regions
+        self.variances: dict[int, Value] = {}
+        if width_index is None:
+            self.exponent = sharpness(g.constant(np.array([widths[0] ** 2], np.float32)), self.ratio)
+        else:
+            width = pack_windows(g, cut_windows(tiles, tile_ids(tiles_of), width_index[0].cpu().numpy()))
+            variances = g.constant(np.array(widths, np.float32) ** 2)[width]
+            self.variances = dict(zip(tiles_of, g.split(variances, [*map(len, tiles_of.values())]), strict=True))
 
     def blocks(self, count: int, slots: Value, row: Value, col: Value) -> Value:
         """Sample the memberships in the blocks of tiles with K regions, (T, blocks, K, 1, P), stored by columns.
 
         `slots`, (T,), are indices among the tiles with K regions; `row` and `col`, (T,), are those of the tiles.
         """
-        g, places = self.graph, self.places
-        windows, smooth_windows = self.windows(count)[slots], self.smooth_windows(count)[slots]
+        g, interpolator = self.graph, self.interpolator
+        windows, smooth_windows = (part.unfold(count)[slots] for part in (self.windows, self.smooth_windows))
 
         def pan() -> Value:
-            return places.blocks(windows, row, col, (count, 1))
+            return interpolator.blocks(windows, row, col, (count, 1))
 
         def sample() -> Value:
-            samples = places.blocks(smooth_windows, row, col, (count, 1))
-            return _sharpen(g, samples, self.exponent(count, slots, row, col))
+            samples = interpolator.blocks(smooth_windows, row, col, (count, 1))
+            exponent = self.exponent
+            if exponent is None:
+                exponent = sharpness(interpolator.blocks(self.variances[count][slots], row, col, (1, 1)), self.ratio)
+            return _sharpen(g, samples, exponent)
 
         def cut() -> Value:
             return g.Reshape(g.Slice(windows, [1, 1], [-1, -1], [2, 3]), [0, 1, count, 1, -1])
 
-        return g.choose(places.is_native, cut, lambda: g.choose(places.is_aligned, pan, sample))
+        return g.choose(interpolator.is_native, cut, lambda: g.choose(interpolator.is_aligned, pan, sample))
 
 
 def _sharpen(g: Graph, samples: Value, exponent: Value) -> Value:
-    """Raise the samples of each pixel to a power, and normalise them to a sum of 1."""
+    """Raise the samples of each pixel to a power, and normalise them to a sum of 1; docs/method.md has the formula."""
     samples = g.Max(samples, _TINY)
     ratios = samples / g.ReduceMax(samples, [2], keepdims=1)
     powers = g.Exp(g.Log(ratios) * exponent)  # Pow takes four times as long

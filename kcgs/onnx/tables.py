@@ -27,8 +27,8 @@ def make_slots(g: Graph, plan: DecoderPlan) -> Slots:
     for number, members in enumerate(groups):
         group_of[members.tiles] = number
     group = pack_integers(g, group_of)
-    order = argsort(g, group, plan.num_blocks)
-    rank = argsort(g, order, plan.num_blocks)
+    order = g.argsort(group, [plan.num_blocks]).astype(INT32)
+    rank = g.argsort(order, [plan.num_blocks]).astype(INT32)
     starts = np.cumsum([0, *(len(members.tiles) for members in groups)])
     slot = rank - g.constant(starts.astype(np.int32))[group]
     tiles = g.split(g.Slice(order, [0], starts[-1:]), np.diff(starts).tolist()) if groups else []
@@ -54,13 +54,8 @@ def make_node_table(g: Graph, nodes: NodeBlocks) -> NodeTable:
     present = pack_flags(g, flags.ravel())
     number = g.CumSum(present, 0) - 1
     block = g.Where(g.Equal(present, np.int32(1)), number, np.int32(count))
-    place = argsort(g, present, count, largest=1)
+    place = g.argsort(present, [count], largest=1).astype(INT32)
     _, regions, rows, cols = nodes.shape
     lines = place // cols
     columns = lines // rows
     return NodeTable(nodes, block, columns // regions, columns % regions, lines % rows, place % cols)
-
-
-def argsort(g: Graph, numbers: Value, count: int, largest: int = 0) -> Value:
-    """Return the int32 indices of the `count` smallest or largest numbers."""
-    return g.argsort(numbers, [count], largest).astype(INT32)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 import torch
@@ -18,34 +18,28 @@ from .tiles import Tiles, read_memberships
 _STEPS = (1 << 16) - 1
 
 
-def stored_windows(
-    g: Graph, membership: Membership, tiles: Tiles, tiles_of: Mapping[int, Integers]
-) -> Callable[[int], Value]:
-    """Return a function that stores windows of contours too wide for a blur in the graph, by the number of regions."""
+class StoredWindows:
+    """Windows of contours that are too wide for a blur in the graph; `tiles_of` as in `BlurredWindows`."""
 
-    def unfold(count: int) -> Value:
-        ids = tiles_of[count].tolist()
+    def __init__(self, g: Graph, membership: Membership, tiles: Tiles, tiles_of: Mapping[int, Integers]) -> None:
+        self.graph, self.membership, self.tiles, self.tiles_of = g, membership, tiles, tiles_of
+
+    def unfold(self, count: int) -> Value:
+        """Store the windows of tiles with K regions, (T, K, S, S), by columns."""
+        ids, tiles = self.tiles_of[count].tolist(), self.tiles
         counts = [len(tiles.regions[tile]) for tile in ids]
         tile = torch.tensor(ids).repeat_interleave(torch.tensor(counts))
         region = torch.tensor([region for tile in ids for region in tiles.regions[tile]])
-        weights = read_memberships(membership, tile, tiles.cols, region).numpy().swapaxes(1, 2)
+        weights = read_memberships(self.membership, tile, tiles.cols, region).numpy().swapaxes(1, 2)
         windows = np.zeros((len(ids), count, *weights.shape[1:]))
         windows[np.arange(count) < np.array(counts)[:, None]] = weights
         step = max(float(windows.max()), 1e-9) / _STEPS
-        return pack_integers(g, np.round(windows / step).astype(np.int64)).astype(FLOAT) * step
-
-    return unfold
+        return pack_integers(self.graph, np.round(windows / step).astype(np.int64)).astype(FLOAT) * step
 
 
 def tile_ids(tiles_of: Mapping[int, Integers]) -> Integers:
     """Return the tiles with several regions, (T,)."""
     return np.concatenate([*tiles_of.values()])
-
-
-def split_tiles(g: Graph, tiles_of: Mapping[int, Integers], values: Value) -> dict[int, Value]:
-    """Split values of all tiles, (T, ...), by the number of regions."""
-    lengths = [len(tiles) for tiles in tiles_of.values()]
-    return dict(zip(tiles_of, g.split(values, lengths), strict=True))
 
 
 def pack_windows(g: Graph, windows: Integers) -> Value:

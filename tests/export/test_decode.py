@@ -47,25 +47,24 @@ def load_script() -> ModuleType:
 SCRIPT_MODULE = load_script()
 
 
-def make_labels(size: tuple[int, int] = SIZE) -> Tensor:
-    y, x = torch.meshgrid(torch.arange(size[0]), torch.arange(size[1]), indexing="ij")
+def make_labels() -> Tensor:
+    y, x = torch.meshgrid(torch.arange(SIZE[0]), torch.arange(SIZE[1]), indexing="ij")
     index = torch.where((x - 20) ** 2 + (y - 15) ** 2 < 80, 2, (x + 2 * y > 70).long())
     return torch.tensor(IDS)[index]
 
 
-def make_field(channels: int = 3, opacities: bool = True, dtype: torch.dtype = torch.float32) -> GaussianField:
-    field = GaussianField.random(60, SIZE, channels=channels, regions=make_labels(), seed=1, dtype=dtype)
+def make_field() -> GaussianField:
+    field = GaussianField.random(60, SIZE, regions=make_labels(), seed=1)
     generator = torch.Generator().manual_seed(2)
-    if opacities:
-        alpha = torch.rand(60, generator=generator).to(dtype)
-        field = GaussianField(field.means, field.cholesky, field.colors, field.region_ids, alpha, size=SIZE)
+    alpha = torch.rand(60, generator=generator)
+    field = GaussianField(field.means, field.cholesky, field.colors, field.region_ids, alpha, size=SIZE)
     with torch.no_grad():
         field.cholesky[:, 1] = torch.randn(60, generator=generator)
         field.colors *= 1.5
     return field
 
 
-def ramp_decoder(interactive: bool, height: str = "10") -> onnx.ModelProto:
+def ramp_decoder(interactive: bool) -> onnx.ModelProto:
     """Stand-in for a scene decoder: red is x, green is y, blue the sum of `visible`, over 16."""
     g = Graph()
     size = g.input("size", INT64, [2])
@@ -79,7 +78,7 @@ def ramp_decoder(interactive: bool, height: str = "10") -> onnx.ModelProto:
     planes = along(1), g.Unsqueeze(along(0), [1]), g.ReduceSum(visible, keepdims=0)
     image = g.Concat(*(g.Unsqueeze(g.Expand(plane, size), [0, 1]) for plane in planes), axis=1) / 16
     metadata = {"format": "kcgs.decoder", "format_version": "1", "kind": "scene", "region_ids": "[7, 9]"}
-    return g.close(image, "image", [1, 3, "H", "W"], metadata=metadata | {"height": height, "width": "12"})
+    return g.close(image, "image", [1, 3, "H", "W"], metadata=metadata | {"height": "10", "width": "12"})
 
 
 def ramp(size: tuple[int, int], view: tuple[float, ...] = (0, 0, 12, 10), blue: float = 3) -> np.ndarray:

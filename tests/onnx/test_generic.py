@@ -18,7 +18,6 @@ from torch import Tensor
 
 import kcgs
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer
-from kcgs.kernels.whitened import support_radius
 from kcgs.onnx import describe_decoder, generic_decoder
 
 ERROR = {0.0: 1e-4, 1e-6: 1e-4, 1e-4: 1e-3}  # allowed, by cutoff
@@ -158,8 +157,16 @@ class TestAgainstRenderer:
         image, exact = decode(field, regions, cutoff), render(field, regions, 0.0)
         assert image[exact < cutoff * 0.999].abs().max() == 0
         above = exact > cutoff * 1.001
+        assert above.any()
         assert torch.allclose(image[above], exact[above], rtol=1e-4)
-        assert support_radius(cutoff, torch.float32) < 10  # so that both sets are there
+
+    @pytest.mark.filterwarnings("ignore:.* Gaussians paint nothing")
+    @pytest.mark.parametrize("regions", [1, 4])
+    def test_ids_that_the_map_does_not_hold(self, regions: int) -> None:
+        labels = blobs((37, 53), regions)
+        field, regions_map = make_field(60, (37, 53), labels), RegionMap.from_labels(labels)
+        field.region_ids[::2] = 999
+        assert (decode(field, regions_map) - render(field, regions_map)).abs().max() < 1e-3
 
     def test_no_gaussian_gives_black(self) -> None:
         labels = torch.zeros(3, 4, dtype=torch.int64)

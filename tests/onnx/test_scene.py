@@ -24,19 +24,17 @@ WIDE_PAIRS = {(2, 5): 5.0, (5, 8): 0.4}
 SOFTNESS: dict[str, Any] = {"hard": 0.0, "soft": 0.8, "pairs": PAIRS, "wide": 6.0, "wide-pairs": WIDE_PAIRS}
 
 
-def blobs(size: tuple[int, int], count: int, seed: int = 0) -> Tensor:
+def blobs(size: tuple[int, int], count: int) -> Tensor:
     """Voronoi regions of random points: `count` regions, ids not consecutive."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     points = torch.rand(count, 2, generator=generator) * torch.tensor(size)
     y, x = torch.meshgrid(*(torch.arange(n) + 0.5 for n in size), indexing="ij")
     nearest = ((y[..., None] - points[:, 0]) ** 2 + (x[..., None] - points[:, 1]) ** 2).argmin(-1)
     return 3 * nearest + 2
 
 
-def scattered(
-    count: int, size: tuple[int, int], regions: RegionMap | None = None, channels: int = 3, seed: int = 0
-) -> Scene:
-    generator = torch.Generator().manual_seed(seed)
+def scattered(count: int, size: tuple[int, int], regions: RegionMap | None = None, channels: int = 3) -> Scene:
+    generator = torch.Generator().manual_seed(0)
     means = torch.rand(count, 2, generator=generator) * torch.tensor([size[1], size[0]]) * 1.2 - 2
     sigma = 0.5 + 0.1 * min(size) * torch.rand(count, 1, generator=generator)
     factors = torch.rand(count, 3, generator=generator) + torch.tensor([0.4, -0.5, 0.4])
@@ -310,6 +308,12 @@ def resized() -> Scene:
     return scattered(5, (40, 60), regions)
 
 
+def with_value(table: str, value: float) -> Scene:
+    scene = scattered(5, (20, 30))
+    getattr(scene.field, table).data[2, 0] = value
+    return scene
+
+
 class TestBadInput:
     @pytest.mark.parametrize(
         ("make", "options", "message"),
@@ -320,6 +324,9 @@ class TestBadInput:
             (lambda: Scene(scattered(5, (20, 30)).field, torch.zeros(20, 30).long()), {}, "scene must have region ids"),
             (resized, {}, "resized"),
             (batch, {}, "scene must be of one image; got a batch of"),
+            (lambda: with_value("means", float("nan")), {}, "means must be finite"),
+            (lambda: with_value("cholesky", -1.0), {}, "cholesky must be finite, l11 and l22 in"),
+            (lambda: with_value("colors", float("inf")), {}, "colors must be finite"),
         ],
     )
     def test_says_what_is_wrong(self, make: Callable[[], Any], options: dict[str, Any], message: str) -> None:
