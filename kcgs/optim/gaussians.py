@@ -89,8 +89,8 @@ class Renderer(NamedTuple):
 
     @torch.enable_grad()
     def weight_sums(self, gaussians: Gaussians) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
-        """Return the weights' sum per pixel, (1, H, W), and a function that sums such a map per Gaussian, (N,)."""
-        ones = torch.ones_like(gaussians.colors[:, :1]).requires_grad_()
+        """Return the sum of weights per pixel, (..., 1, H, W), and a function from such a map to sums per Gaussian."""
+        ones = torch.ones_like(gaussians.colors[..., :1]).requires_grad_()
         total = self.render(gaussians._replace(colors=ones))
         # the render is linear in the colours, so its gradient by them has the sums
-        return total.detach(), lambda values: torch.autograd.grad(total, ones, values, retain_graph=True)[0][:, 0]
+        return total.detach(), lambda values: torch.autograd.grad(total, ones, values, retain_graph=True)[0][..., 0]
