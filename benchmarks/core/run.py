@@ -74,9 +74,9 @@ def run_experiment(
     """Measure the jobs without a result, then write results.csv, run.json and report.md.
 
     A job is the keyword arguments of `measure`, a function of a module, which returns rows of JSON's values. The rows
-    are kept in OUTPUT/runs, under a hash of the job, of the text above `page` in the module, and of the code of kcgs
-    and benchmarks/core; remove the folder to measure anew. An interruption leaves the results so far: `--redraw`
-    reports them, and the same command goes on.
+    are kept in OUTPUT/runs, under a hash of the job and of the code of kcgs and of the benchmarks, but for what is
+    below `page`; remove the folder to measure anew. An interruption leaves the results so far: `--redraw` reports them,
+    and the same command goes on.
     """
     if not options.redraw:
         all_jobs = jobs(options)
@@ -144,21 +144,19 @@ def _module_of(function: Callable[..., Any]) -> ModuleType:
 
 
 def _path(folder: Path, measure: Measure, job: Job) -> Path:
-    # what is above `page` measures; a report may be written anew from its rows
-    text = inspect.getsource(_module_of(measure)).partition("\ndef page(")[0]
-    parts = [measure.__module__, text, job, _sources()]
+    parts = [measure.__module__, job, _sources()]
     key = hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
     return folder / f"{str(job['image']).replace('/', '-')}-{key[:20]}.json"
 
 
 @cache
 def _sources() -> str:
-    """Hash what kcgs and the benchmarks compute with."""
+    """Hash what kcgs and the benchmarks measure with, not what is below a line `def page(`: this only reports."""
     digest = hashlib.sha256()
-    folders = Path(kcgs.__file__).parent, Path(__file__).parent
+    folders = Path(kcgs.__file__).parent, Path(__file__).parent.parent
     for path in (path for folder in folders for path in sorted(folder.rglob("*"))):
         if path.suffix in (".py", ".toml", ".bin"):
-            digest.update(path.read_bytes())
+            digest.update(path.read_bytes().partition(b"\ndef page(")[0])
     return digest.hexdigest()
 
 
