@@ -96,7 +96,7 @@ class MappedScene:
         if "labels" not in self.tensors:
             return None
         labels = _inflate(self.tensors["labels"], **self._header["labels"])
-        return RegionMap.from_labels(labels, softness_from_plain(self._header["softness"]))
+        return RegionMap(labels, softness_from_plain(self._header["softness"]))
 
     def scene(self, index: int) -> Scene:
         """Return one of the scenes, without rows of the colour 0."""
@@ -148,7 +148,7 @@ def _assemble(tensors: dict[str, Tensor], header: Any) -> Scene:
     regions = None
     if "labels" in tensors:
         softness = softness_from_plain(header["softness"])
-        regions = RegionMap.from_labels(_inflate(tensors["labels"], **header["labels"]), softness)
+        regions = RegionMap(_inflate(tensors["labels"], **header["labels"]), softness)
     return Scene(field, regions, header["notes"])
 
 

@@ -119,7 +119,7 @@ def test_maps_mean_the_same_by_every_way_in(mode: str, tmp_path: Path) -> None:
     expected = load_labels(tmp_path / "map.png")
     assert torch.equal(expected > 0, torch.from_numpy(values > 0))
     for value in (image, tmp_path / "map.png", str(tmp_path / "map.png")):
-        assert torch.equal(RegionMap.from_labels(value).labels, expected)
+        assert torch.equal(RegionMap(value).labels, expected)
         assert torch.equal(edge_band(value), edge_band(expected))
 
 
@@ -153,9 +153,9 @@ def soft_mask(blur: float, noise: int = 0) -> np.ndarray:
     ],
 )
 def test_masks_with_soft_edges_are_refused(blur: float, noise: int, convert: Callable[..., object]) -> None:
-    assert RegionMap.from_labels(convert(soft_mask(0))).num_regions == 2
+    assert RegionMap(convert(soft_mask(0))).num_regions == 2
     with pytest.raises(InvalidArgument, match=r"soft edges has: pass np\.asarray\(labels.*\) > 127"):
-        RegionMap.from_labels(convert(soft_mask(blur, noise)))
+        RegionMap(convert(soft_mask(blur, noise)))
 
 
 @pytest.mark.parametrize("mode", ["L", "LA", "RGB"])
@@ -173,7 +173,7 @@ def test_many_ids_are_no_soft_edges() -> None:
     big = np.zeros((96, 96), np.uint8)
     big[:, 48:], big[:48, :48] = 255, cells
     for labels in (cells, big, np.asarray(Image.fromarray(cells).resize((20, 20), Image.Resampling.NEAREST))):
-        assert RegionMap.from_labels(labels).num_regions == len(np.unique(labels))
+        assert RegionMap(labels).num_regions == len(np.unique(labels))
 
 
 def test_images_may_pass_their_range_by_a_tolerance() -> None:

@@ -45,7 +45,7 @@ class TestEvaluate:
     def test_labels_have_the_contours(self) -> None:
         scene, image = make_scene(None), torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(0))
         assert math.isnan(evaluate(scene, image)["ef_psnr"])
-        soft = RegionMap.from_labels(LABELS, 0.7)
+        soft = RegionMap(LABELS, 0.7)
         values = {
             evaluate(scene, image, labels)["ef_psnr"]
             for labels in (soft, LABELS, LABELS.bool(), LABELS.numpy(), LABELS[None])

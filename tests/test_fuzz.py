@@ -73,7 +73,7 @@ def test_region_splat(
     backend: str,
 ) -> None:  # fmt: skip
     def call() -> object:
-        regions = RegionMap.from_labels(labels, softness) if softness else labels
+        regions = RegionMap(labels, softness) if softness else labels
         image = region_splat(means, cholesky, colors, ids, regions, cutoff=cutoff, backend=backend)
         assert torch.isfinite(image).all() or image.dtype == torch.float16 or colors.abs().max() > 1e30
         return image
@@ -98,7 +98,7 @@ def test_metrics(image: Tensor, target: Tensor, labels: Tensor, width: float) ->
 def test_regions(labels: Tensor, means: Tensor, width: float, size: tuple[int, int]) -> None:
     works_or_refuses(lambda: edge_band(labels, width))
     works_or_refuses(lambda: lookup_regions(means, labels))
-    works_or_refuses(lambda: RegionMap.from_labels(labels).resize(size))
+    works_or_refuses(lambda: RegionMap(labels).resize(size))
     works_or_refuses(lambda: cholesky_to_scale_rotation(means))
 
 

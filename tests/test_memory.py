@@ -93,7 +93,7 @@ def write_scene(factor: int) -> Callable[[Path, int], None]:
     def write(path: Path, side: int) -> None:
         regions = torch.from_numpy(labels(side) * factor)
         field = GaussianField.random(9, (side, side), regions=regions, seed=0)
-        path.write_bytes(encode(Scene(field, RegionMap.from_labels(regions))))
+        path.write_bytes(encode(Scene(field, RegionMap(regions))))
 
     return write
 

@@ -26,7 +26,7 @@ class Toned(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         torch.manual_seed(0)
-        regions = RegionMap.from_labels((torch.arange(SIZE[1]) // 11).expand(SIZE), 0.8)
+        regions = RegionMap((torch.arange(SIZE[1]) // 11).expand(SIZE), 0.8)
         self.scene = Scene(GaussianField.random(40, SIZE, regions=regions, seed=0), regions)
         self.render, self.tone = RegionSplatRenderer(), nn.Conv2d(3, 3, 1)
 

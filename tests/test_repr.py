@@ -45,7 +45,7 @@ def result() -> FitResult:
 def objects(result: FitResult, folder: Path) -> Iterator[Any]:
     """Yield an object of every public class, as large as those of users."""
     field = GaussianField.random(4000, SIZE, regions=LABELS, seed=0)
-    regions = RegionMap.from_labels(LABELS, WIDTHS)
+    regions = RegionMap(LABELS, WIDTHS)
     scene = Scene(field, regions, {"title": "a long note " * 40})
     image, data = torch.rand(3, *SIZE), codec.encode(result.scene)
     yield from (result, result.history[0], result.regions, field, regions, regions.resize((128, 192)), scene)

@@ -19,10 +19,10 @@ from tests.tester import BaseTester
 SIZE = (20, 30)
 MAPS = {
     "none": None,
-    "hard": RegionMap.from_labels((torch.arange(30) // 11).expand(SIZE)),
-    "soft": RegionMap.from_labels((torch.arange(30) // 11).expand(SIZE), 0.8),
-    "pairs": RegionMap.from_labels((torch.arange(30) // 11).expand(SIZE), {(0, 1): 0.5, (1, 2): 1.5}),
-    "resized": RegionMap.from_labels((torch.arange(60) // 23).expand(40, 60), 1.0).resize(SIZE),
+    "hard": RegionMap((torch.arange(30) // 11).expand(SIZE)),
+    "soft": RegionMap((torch.arange(30) // 11).expand(SIZE), 0.8),
+    "pairs": RegionMap((torch.arange(30) // 11).expand(SIZE), {(0, 1): 0.5, (1, 2): 1.5}),
+    "resized": RegionMap((torch.arange(60) // 23).expand(40, 60), 1.0).resize(SIZE),
 }
 
 
@@ -31,7 +31,7 @@ def batch_of(one: RegionMap) -> RegionMap:
     if one._source is not None:
         return batch_of(one._source).resize(one.size)
     labels = torch.stack([one.labels, one.labels.flip(-1), torch.ones_like(one.labels)])
-    return RegionMap.from_labels(labels, one.softness)
+    return RegionMap(labels, one.softness)
 
 
 def make_field(regions: RegionMap | None = None) -> GaussianField:
@@ -62,7 +62,7 @@ class TestCopies:
             scene().sum().backward()
         copies = copy.deepcopy(scene), pickle.loads(pickle.dumps(scene))
         image = scene()
-        monkeypatch.setattr(RegionMap, "from_labels", None)
+        monkeypatch.setattr(RegionMap, "__init__", None)
         for other in copies:
             assert torch.equal(other(), image) and other.metadata == {"title": name}
             other().square().sum().backward()
@@ -178,7 +178,7 @@ class TestScene(BaseTester):
 
     def test_labels_are_a_map_with_hard_contours(self) -> None:
         mask = (torch.arange(30) >= 11).expand(SIZE)
-        expected = Scene(GaussianField.random(40, SIZE, regions=mask, seed=0), RegionMap.from_labels(mask))()
+        expected = Scene(GaussianField.random(40, SIZE, regions=mask, seed=0), RegionMap(mask))()
         for labels in (mask, mask.long(), mask.numpy(), mask.numpy().astype("uint8")):
             assert torch.equal(Scene(GaussianField.random(40, SIZE, regions=labels, seed=0), labels)(), expected)
 

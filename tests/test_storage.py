@@ -110,16 +110,16 @@ def path(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def saved(path: Path) -> Path:
-    save(path, Scene(make_field(), RegionMap.from_labels(make_labels(), 0.75), metadata={"title": "a"}))
+    save(path, Scene(make_field(), RegionMap(make_labels(), 0.75), metadata={"title": "a"}))
     return path
 
 
 SCENES: dict[str, Callable[[], Scene]] = {
     "float32": lambda: Scene(make_extreme_field(torch.float32), make_labels()),
     "float64": lambda: Scene(make_extreme_field(torch.float64), make_labels()),
-    "soft": lambda: Scene(make_field(opacities=False), RegionMap.from_labels(make_labels(), 1 / 3)),
-    "widths of pairs": lambda: Scene(make_field(), RegionMap.from_labels(make_labels(), WIDTHS)),
-    "batch of one map": lambda: Scene(make_field(), RegionMap.from_labels(make_labels()[None], WIDTHS)),
+    "soft": lambda: Scene(make_field(opacities=False), RegionMap(make_labels(), 1 / 3)),
+    "widths of pairs": lambda: Scene(make_field(), RegionMap(make_labels(), WIDTHS)),
+    "batch of one map": lambda: Scene(make_field(), RegionMap(make_labels()[None], WIDTHS)),
     "grey without a map": lambda: Scene(make_field(channels=1)),
     "without region ids": lambda: Scene(GaussianField.random(5, SIZE, channels=4, seed=0)),
     "int16 labels": lambda: Scene(make_field(), make_labels().to(torch.int16)),

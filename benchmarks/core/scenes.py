@@ -40,7 +40,7 @@ def scene_of(name: str, data: str = "") -> Scene:
         return Scene(GaussianField(field.means, field.cholesky, field.colors, size=field.size))
     if contours == "soft" and is_fitted:
         return scene
-    return Scene(field, RegionMap.from_labels(regions.labels, 0.7 if contours == "soft" else 0.0))
+    return Scene(field, RegionMap(regions.labels, 0.7 if contours == "soft" else 0.0))
 
 
 def fits_in(data: Path | None) -> list[str]:
@@ -85,7 +85,7 @@ def workload(height: int, width: int, count: int, seed: int = 0) -> Scene:
     disc = (x - width / 2) ** 2 + (y - height / 2) ** 2 < (height / 4) ** 2
     labels = torch.where(disc, 5, blocks)
     field = GaussianField(means, cholesky, uniform(count, 3), lookup_regions(means, labels), size=(height, width))
-    return Scene(field, RegionMap.from_labels(labels))
+    return Scene(field, RegionMap(labels))
 
 
 def batch(images: int, height: int, width: int, count: int) -> Scene:
@@ -94,4 +94,4 @@ def batch(images: int, height: int, width: int, count: int) -> Scene:
     field, regions = GaussianField.stack([scene.field for scene in scenes]), scenes[0].regions
     assert regions is not None
     labels = torch.stack([regions.labels.roll(index, 1) for index in range(images)])
-    return Scene(field.assign_regions(labels), RegionMap.from_labels(labels))
+    return Scene(field.assign_regions(labels), RegionMap(labels))

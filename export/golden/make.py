@@ -69,7 +69,7 @@ def make_labels(ids: tuple[int, ...]) -> Tensor:
 
 def make_scene(case: Case) -> Scene:
     """Spread Gaussians of all shapes over the image and beyond its border."""
-    regions = RegionMap.from_labels(make_labels(case.ids), case.softness) if case.ids else None
+    regions = RegionMap(make_labels(case.ids), case.softness) if case.ids else None
     count, height, width = 40, *SIZE
     means = uniform(count, 2, 0) * torch.tensor([width + 6.0, height + 6.0]) - 3
     shapes = uniform(count, 3, 2)

@@ -180,7 +180,7 @@ def read_regions(
         raise InvalidArgument("regions", expected, f"{labels.shape[-1]} x {labels.shape[-2]}")
     from kcgs.functional import RegionMap
 
-    return RegionMap.from_labels(labels).resize(size).labels
+    return RegionMap(labels).resize(size).labels
 
 
 def report_fit(

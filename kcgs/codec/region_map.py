@@ -59,7 +59,7 @@ def decode_region_map(data: bytes, size: tuple[int, int], num_regions: int) -> R
     pixels, ids = decode_ids(stream, size, num_regions, is_file=False)
     if len(ids) != num_regions:
         raise CodecError(f"the map must have {num_regions} regions; got {len(ids)}")
-    with torch.inference_mode(False):  # as RegionMap.from_labels does
+    with torch.inference_mode(False):  # as RegionMap does
         labels = torch.from_numpy(label_pixels(ids, decode_numbers(pixels, size, num_regions, is_file=False)))
     count = reader.varint("numbers of softness", 1, min(_MAX_UNITS + 1, len(data)))
     palette = [reader.varint("softness", 0, _MAX_UNITS) / _UNITS for _ in range(count)]

@@ -194,7 +194,7 @@ def _with_softness(regions: RegionMap, softness: float | PairSoftness | None, fi
     def width(softness: float | PairSoftness, a: int, b: int) -> float:
         return softness if isinstance(softness, float) else softness.get((a, b), 0.0)
 
-    return RegionMap.from_labels(
+    return RegionMap(
         regions.labels,
         {
             (a, b): width(before, a, b) if min(a, b) < first_id else width(softness, a - first_id, b - first_id)

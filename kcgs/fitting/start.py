@@ -87,11 +87,11 @@ def _map_to_render(image: Tensor, regions: RegionMap, problem: Problem) -> Regio
     if regions.num_regions == 1 or regions.softness != 0.0 or config.softness == 0.0:
         return regions
     if config.softness != "auto":
-        return RegionMap.from_labels(regions.labels, config.softness)
+        return RegionMap(regions.labels, config.softness)
     return with_chosen_softness(image, regions)
 
 
 def with_chosen_softness(image: Tensor, regions: RegionMap) -> RegionMap:
     """Give each contour of a map the softness that explains the image best."""
     labels = regions.labels.cpu()
-    return RegionMap.from_labels(labels, choose_softness(image, labels)).to(image.device)
+    return RegionMap(labels, choose_softness(image, labels)).to(image.device)

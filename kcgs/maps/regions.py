@@ -89,7 +89,7 @@ class RegionMap:
 
     @classmethod
     def from_labels(cls, labels: Any, softness: GivenSoftness = 0.0) -> RegionMap:
-        """Return RegionMap(labels, softness): new code calls the constructor, older code keeps this name."""
+        """Return RegionMap(labels, softness)."""
         return cls(labels, softness)
 
     @property

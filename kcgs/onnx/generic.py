@@ -43,7 +43,7 @@ def generic_decoder(*, cutoff: float = 1e-4, clamp: bool = True) -> onnx.ModelPr
         >>> import onnxruntime
         >>> from kcgs import GaussianField, RegionMap
         >>> labels = (torch.arange(48) >= 24).long().expand(32, 48)
-        >>> regions = RegionMap.from_labels(labels, 0.7)
+        >>> regions = RegionMap(labels, 0.7)
         >>> field = GaussianField.random(10, (32, 48), regions=regions, seed=0)
         >>> feeds = {name: getattr(field, name).detach().numpy() for name in ("means", "cholesky", "colors")}
         >>> feeds["region_ids"] = regions.index_of(field.region_ids).numpy()

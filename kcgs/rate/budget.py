@@ -279,7 +279,7 @@ def _choose_regions(problem: Problem, target_bytes: int) -> _RegionChoice:
     contour_cost = bit_value * (8 * map_bytes / max(len(contour_edges(regions.labels)[0]), 1))
     paying_regions = regions
     if regions.softness == 0.0:
-        paying_regions = RegionMap.from_labels(merge_regions(image, regions.labels, contour_cost))
+        paying_regions = RegionMap(merge_regions(image, regions.labels, contour_cost))
     choice = choice._replace(changes={"merged_for_bytes": regions.num_regions - paying_regions.num_regions})
     max_regions = num_gaussians(target_bytes - _map_bytes(paying_regions))
     candidate = paying_regions.merge(pairs_to_merge(image, paying_regions.labels, max_regions))[0]

@@ -33,5 +33,5 @@ def stack(frames: Sequence[Scene], metadata: Mapping[str, str]) -> Scene:
     for regions in maps:
         softness |= regions.softness if isinstance(regions.softness, Mapping) else {}
     labels = torch.stack([regions.labels for regions in maps])
-    regions = RegionMap.from_labels(labels, softness or maps[0].softness)
+    regions = RegionMap(labels, softness or maps[0].softness)
     return Scene(field, regions, metadata)

@@ -29,7 +29,7 @@ class TestStart:
     @pytest.mark.parametrize("count", [1, 200, 48 * 64])
     def test_centres_follow_the_detail_and_no_pixel_has_two(self, count: int) -> None:
         labels = (torch.arange(64) > 40).long().expand(48, 64)
-        field = gradient_field(photo(2)[None].double(), count, RegionMap.from_labels(labels), 0)[0]
+        field = gradient_field(photo(2)[None].double(), count, RegionMap(labels), 0)[0]
         assert len(field.means.floor().unique(dim=0)) == field.num_gaussians == count
         assert field.colors.shape == (count, 2) and field.colors.dtype == torch.float64
         assert torch.equal(field.region_ids, (field.means[:, 0] > 41).long())

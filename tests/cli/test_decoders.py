@@ -30,7 +30,7 @@ def _scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     labels = torch.zeros(32, 48, dtype=torch.long)
     labels[:, 20:] = 4
-    regions = RegionMap.from_labels(labels, 0.7)
+    regions = RegionMap(labels, 0.7)
     field = GaussianField.random(30, (32, 48), seed=0)
     field.assign_regions(regions)
     scene = Scene(field, regions, {"recipe": "best"})

@@ -43,7 +43,7 @@ def make_scene(
     ids = labels.unique()[torch.randint(regions, (count,), generator=generator)]
     pairs = labels.unique().tolist()
     widths = {(pairs[i], pairs[i + 1]): 0.25 * (i % 5) for i in range(regions - 1)}
-    return Scene(GaussianField(means, cholesky, colors, ids, size=size), RegionMap.from_labels(labels, widths))
+    return Scene(GaussianField(means, cholesky, colors, ids, size=size), RegionMap(labels, widths))
 
 
 def make_labels(seed: int, size: tuple[int, int] = (120, 160), count: int = 6) -> NDArray[np.int64]:

@@ -96,7 +96,7 @@ class TestDamagedScenes:
     def test_surplus_bytes(self, data: bytes, scene: Scene) -> None:
         with pytest.raises(CodecError, match="the file must end after"):
             decode(data + b"\0")
-        uniform = RegionMap.from_labels(scene.regions.labels, 0.5)
+        uniform = RegionMap(scene.regions.labels, 0.5)
         header, region_map, layers = unpack(encode(Scene(scene.field, uniform)))
         with pytest.raises(CodecError, match="the map must end after"):
             decode(pack(header, region_map + b"\0", layers))

@@ -166,7 +166,7 @@ class TestEncode:
             encode(scene)
 
     def test_resized_maps(self, scene: Scene) -> None:
-        regions = RegionMap.from_labels(scene.regions.labels, 0.5).resize((12, 18))
+        regions = RegionMap(scene.regions.labels, 0.5).resize((12, 18))
         field = GaussianField.random(9, (12, 18), regions=regions.labels, seed=0)
         with pytest.raises(ValueError, match="regions must be a map of its own pixels"):
             encode(Scene(field, regions))

@@ -292,7 +292,7 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 class TestLabels:
     def test_in_a_scene(self, name: str) -> None:
-        check_map(RegionMap.from_labels(torch.from_numpy(np.asarray(CASES[name], np.int64))))
+        check_map(RegionMap(torch.from_numpy(np.asarray(CASES[name], np.int64))))
 
     def test_as_a_file(self, name: str) -> None:
         labels = np.asarray(CASES[name], np.int64)
@@ -316,14 +316,14 @@ def check_map(regions: RegionMap, data: bytes | None = None) -> None:
 class TestWidths:
     @pytest.mark.parametrize("softness", [0.0, 0.75])
     def test_one(self, softness: float) -> None:
-        check_map(RegionMap.from_labels(torch.from_numpy(cells(20, 30, 3)), softness))
+        check_map(RegionMap(torch.from_numpy(cells(20, 30, 3)), softness))
 
     def test_of_each_pair(self) -> None:
         labels = torch.from_numpy(shuffled(cells(40, 60, 24)))
         ids = labels.unique().tolist()
         pairs = [(a, b) for a in ids for b in ids if a < b]
         widths = {pair: (0.0, 0.5, 0.5, 1.25)[i % 4] for i, pair in enumerate(pairs)}
-        check_map(RegionMap.from_labels(labels, widths))
+        check_map(RegionMap(labels, widths))
 
 
 def test_golden() -> None:

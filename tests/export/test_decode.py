@@ -152,7 +152,7 @@ class TestSceneDecoders:
 
     @pytest.mark.parametrize("softness", [0.0, 0.7])
     def test_a_scene_of_the_library(self, decode: Any, tmp_path: Path, softness: float) -> None:
-        field, regions = make_field(), RegionMap.from_labels(make_labels(), softness)
+        field, regions = make_field(), RegionMap(make_labels(), softness)
         decoder, output = tmp_path / "decoder.onnx", tmp_path / "out.png"
         onnx.save(scene_decoder(Scene(field, regions), clamp=False, interactive=True), decoder)
         assert decode(decoder, "-o", output, "--scale", 2) == Result(0, "", "")

@@ -98,13 +98,13 @@ def random_scene(seed: int) -> Scene:
     if regions == 1:
         return Scene(GaussianField(*numbers, size=size))
     labels = random_labels(generator, size, regions)
-    hard = RegionMap.from_labels(labels)
+    hard = RegionMap(labels)
     softness: float | dict[tuple[int, int], float] = float(generator.choice([0.0, 0.5, 1.3]))
     if generator.random() < 0.4:
         pairs = sorted(touching_pairs(hard.labels))
         softness = {pair: float(generator.choice([0.0, 0.25, 0.7, 2.0])) for pair in pairs}
     ids = hard.ids[torch.from_numpy(generator.integers(0, hard.num_regions, count))]
-    return Scene(GaussianField(*numbers, ids, size=size), RegionMap.from_labels(labels, softness))
+    return Scene(GaussianField(*numbers, ids, size=size), RegionMap(labels, softness))
 
 
 def check_scenes(reader: Reader, seeds: range) -> None:

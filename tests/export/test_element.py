@@ -81,7 +81,7 @@ def random_scene(kind: str, channels: int = 3) -> Scene:
         ids = labels.unique().tolist()
         pairs = [(a, b) for a in ids for b in ids if a < b]
         softness = {pair: (0.0, 0.5, 1.0, 2.5)[i % 4] for i, pair in enumerate(pairs)}
-    regions = None if kind == "plain" else RegionMap.from_labels(labels, softness)
+    regions = None if kind == "plain" else RegionMap(labels, softness)
     return Scene(GaussianField.random(150, size, channels=channels, regions=regions, seed=1), regions)
 
 
@@ -194,7 +194,7 @@ class TestEdits:
         # no pixel of the regions that move is as far from one neighbour as from another
         labels = torch.bucketize(torch.arange(90), torch.tensor([19, 43, 67])).expand(60, -1)
         widths = {(0, 1): 0.5, (1, 2): 0.0, (2, 3): 2.5}
-        regions = RegionMap.from_labels(labels, widths)
+        regions = RegionMap(labels, widths)
         scene = show(page, site, Scene(GaussianField.random(150, (60, 90), regions=regions, seed=1), regions))
         first, second = 1, 2
         page.evaluate(f"(image.move([{first}, {second}], 11, -7), 1)")

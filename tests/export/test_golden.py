@@ -56,7 +56,7 @@ def scene_of(case: Arrays) -> tuple[GaussianField, RegionMap | None]:
     labels, ids = (torch.from_numpy(case[name].astype(np.int64)) for name in ("labels", "region_ids"))
     pairs: Any = case["softness"]
     softness = {(int(a), int(b)): float(w) for a, b, w in pairs} if pairs.ndim else float(pairs)
-    regions = RegionMap.from_labels(labels, softness)
+    regions = RegionMap(labels, softness)
     return GaussianField(*numbers, ids, opacities, size=size_of(case)), regions
 
 

@@ -132,7 +132,7 @@ class TestSettings:
             "bool": labels.bool(),
             "array": labels.bool().numpy(),
             "one of a batch": labels[None],
-            "RegionMap of one": RegionMap.from_labels(labels[None], {(0, 1): 0.5}),
+            "RegionMap of one": RegionMap(labels[None], {(0, 1): 0.5}),
         }[kind]
         softness = 0.5 if kind.startswith("Region") else 0.0
         recipe = quick(softness=softness, iterations=5)
@@ -187,7 +187,7 @@ class TestSwitches:
 
     def test_softness_of_the_map_or_the_recipe(self) -> None:
         image, labels = disc()
-        assert fit(image, RegionMap.from_labels(labels, 0.9), 5, recipe=quick()).scene.regions.softness == 0.9
+        assert fit(image, RegionMap(labels, 0.9), 5, recipe=quick()).scene.regions.softness == 0.9
         assert fit(image, labels, 5, recipe=quick(softness=0.7)).scene.regions.softness == 0.7
 
     def test_no_region_starts_empty(self) -> None:

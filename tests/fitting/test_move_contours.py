@@ -40,7 +40,7 @@ def noisy_problem(seed: int, dtype: torch.dtype = torch.float32) -> tuple[Gaussi
     size = (20 + seed % 7, 33 - seed % 5)
     coarse = torch.randint(0, 2 + seed % 5, (5, 6), generator=draw) * 3 + 1
     rows, columns = (torch.arange(n) * m // n for n, m in zip(size, (5, 6), strict=True))
-    regions = RegionMap.from_labels(coarse[rows][:, columns], (seed % 3) * 0.5)
+    regions = RegionMap(coarse[rows][:, columns], (seed % 3) * 0.5)
     channels = 1 + seed % 4
     field = GaussianField.random(30, size, channels=channels, regions=regions, seed=seed, dtype=dtype)
     image = torch.rand(channels, *size, generator=draw)
@@ -116,11 +116,11 @@ class TestEnergy:
 
     def test_length_of_known_contours(self) -> None:
         field, image = flat_field({0: [0.0], 1: [0.0]}, (24, 40)), torch.zeros(1, 24, 40)
-        straight = contour_energy(Scene(field, RegionMap.from_labels(step(9))), image, length_weight=1.0)
+        straight = contour_energy(Scene(field, RegionMap(step(9))), image, length_weight=1.0)
         assert straight == pytest.approx((24 + 2 * 23) / 4)
         alone = torch.zeros(24, 40, dtype=torch.long)
         alone[5, 5] = 1
-        energy = contour_energy(Scene(field, RegionMap.from_labels(alone)), image, length_weight=1.0)
+        energy = contour_energy(Scene(field, RegionMap(alone)), image, length_weight=1.0)
         assert energy == pytest.approx(2.0 + 0.3 * 12**2)
 
     @pytest.mark.parametrize("seed", range(24))
@@ -163,20 +163,20 @@ class TestMoves:
     def test_onto_the_edge(self, given: int, softness: float) -> None:
         image = step(12).float()[None].expand(3, -1, -1)
         field = flat_field({0: [0.0] * 3, 1: [1.0] * 3}, (24, 40))
-        refined = refine_contours(Scene(field, RegionMap.from_labels(step(given), softness)), image)
+        refined = refine_contours(Scene(field, RegionMap(step(given), softness)), image)
         assert torch.equal(refined.labels, step(12))
         assert refined.softness == softness
         assert torch.allclose(Scene(field, refined.labels).render(), image, atol=1e-3)
 
     def test_a_map_that_is_right_stays(self) -> None:
-        regions = RegionMap.from_labels(step(12))
+        regions = RegionMap(step(12))
         field = flat_field({0: [0.0], 1: [1.0]}, (24, 40))
         assert refine_contours(Scene(field, regions), step(12).float()[None]) is regions
 
     def test_distance_bound_holds_for_repeated_calls(self) -> None:
         image, given = step(20).float()[None], step(12)
         field = flat_field({0: [0.0], 1: [1.0]}, (24, 40))
-        regions = RegionMap.from_labels(given)
+        regions = RegionMap(given)
         for _ in range(4):
             regions = refine_contours(Scene(field, regions), image, anchor=given)
         assert torch.equal(regions.labels, step(15))
@@ -192,7 +192,7 @@ class TestMoves:
             assert set(regions.ids.tolist()) == set(start.ids.tolist())
 
     def test_without_bound_it_moves_on(self) -> None:
-        image, regions = step(30).float()[None], RegionMap.from_labels(step(12))
+        image, regions = step(30).float()[None], RegionMap(step(12))
         field = flat_field({0: [0.0], 1: [1.0]}, (24, 40))
         once = refine_contours(Scene(field, regions), image, max_distance=None)
         assert torch.equal(once.labels, step(18))  # reach times sweeps
@@ -218,16 +218,14 @@ class TestMoves:
 
     def test_a_region_without_gaussians_is_black(self) -> None:
         field = flat_field({1: [1.0]}, (24, 40))
-        refined = refine_contours(Scene(field, RegionMap.from_labels(step(10))), step(12).float()[None])
+        refined = refine_contours(Scene(field, RegionMap(step(10))), step(12).float()[None])
         assert torch.equal(refined.labels, step(12))
 
     def test_opacities_count(self) -> None:
         flat = flat_field({0: [0.0], 1: [4.0]}, (24, 40))
         opacities = torch.tensor([1.0, 0.25])
         field = GaussianField(flat.means, flat.cholesky, flat.colors, flat.region_ids, opacities, size=flat.size)
-        assert torch.equal(
-            refine_contours(Scene(field, RegionMap.from_labels(step(10))), step(12).float()[None]).labels, step(12)
-        )
+        assert torch.equal(refine_contours(Scene(field, RegionMap(step(10))), step(12).float()[None]).labels, step(12))
 
 
 class TestShape:
@@ -235,10 +233,10 @@ class TestShape:
         image = step(12).float()[None].clone()
         image[:, 4:6, 13:15] = 0.0  # of the other colour, away from the contour
         image[:, 14:16, 9:11] = 1.0
-        field, regions = flat_field({0: [0.0], 1: [1.0]}, (24, 40)), RegionMap.from_labels(step(12))
+        field, regions = flat_field({0: [0.0], 1: [1.0]}, (24, 40)), RegionMap(step(12))
         kept = refine_contours(Scene(field, regions), image, blur=0.0, smallest=1)
         assert small_pieces(kept.labels, 12) == 2
-        refined = refine_contours(Scene(field, RegionMap.from_labels(step(11))), image, blur=0.0)
+        refined = refine_contours(Scene(field, RegionMap(step(11))), image, blur=0.0)
         assert torch.equal(refined.labels, step(12))
 
     def test_pieces_that_were_small_stay(self) -> None:
@@ -264,7 +262,7 @@ class TestShape:
     def test_no_region_vanishes(self, distance: float | None) -> None:
         labels = step(20)
         labels[3, 3], labels[10:12, 8], labels[15:19, 30:36] = 5, 6, 9
-        regions = RegionMap.from_labels(labels, 0.7)
+        regions = RegionMap(labels, 0.7)
         # each would be better off without 5, 6 and 9
         field = flat_field({0: [0.0], 1: [1.0], 5: [9.0], 6: [-9.0], 9: [7.0]}, (24, 40))
         for _ in range(3):
@@ -284,7 +282,7 @@ class TestShape:
         labels = step(20)
         labels[::2, 20:22] = 0  # a comb
         image = (step(20).float() + 0.8 * torch.randn(24, 40, generator=draw))[None]
-        field, regions = flat_field({0: [0.0], 1: [1.0]}, (24, 40)), RegionMap.from_labels(labels)
+        field, regions = flat_field({0: [0.0], 1: [1.0]}, (24, 40)), RegionMap(labels)
 
         def length(weight: float) -> float:
             settings = {"blur": 0.0, "smallest": 1, "max_distance": None}
@@ -304,11 +302,11 @@ class TestShape:
         bumpy[:, 3::6, 12] = 0.0
         field = flat_field({0: [0.0], 1: [0.1]}, (24, 40))
         for start in (image, bumpy):
-            regions = RegionMap.from_labels((start[0] > 0).long())
+            regions = RegionMap((start[0] > 0).long())
             assert torch.equal(refine_contours(Scene(field, regions), bumpy, blur=0.0).labels, labels)
 
     def test_one_region_returns_the_map(self) -> None:
-        regions = RegionMap.from_labels(torch.full((24, 40), 7))
+        regions = RegionMap(torch.full((24, 40), 7))
         assert refine_contours(Scene(flat_field({7: [0.3]}, (24, 40)), regions), torch.rand(1, 24, 40)) is regions
 
     @pytest.mark.parametrize("size", [(1, 2), (1, 9), (9, 1), (2, 2)])
@@ -316,7 +314,7 @@ class TestShape:
         labels = torch.zeros(size, dtype=torch.long)
         labels[-1, -1] = 1
         refined = refine_contours(
-            Scene(flat_field({0: [0.0], 1: [1.0]}, size), RegionMap.from_labels(labels)), torch.zeros(1, *size)
+            Scene(flat_field({0: [0.0], 1: [1.0]}, size), RegionMap(labels)), torch.zeros(1, *size)
         )
         assert torch.equal(refined.labels, labels)
 
@@ -327,7 +325,7 @@ class TestShape:
         image[..., 14:] = 1.0
         image[:, 10:14, 12:14] = 1.0  # here 2 reaches 0, through 1
         field = flat_field({0: [0.0], 1: [0.0], 2: [1.0], 3: [0.0]}, (24, 40))
-        regions = RegionMap.from_labels(labels, {(0, 1): 0.5, (1, 2): 1.5})
+        regions = RegionMap(labels, {(0, 1): 0.5, (1, 2): 1.5})
         refined = refine_contours(Scene(field, regions), image, max_distance=5, blur=0.0, length_weight=1e-4)
         assert (refined.labels[10:14, 11:13] == torch.tensor([0, 2])).all()
         assert dict(refined.softness) == {(0, 1): 0.5, (0, 2): 1.0, (1, 2): 1.5}
@@ -340,7 +338,7 @@ class TestPhoto:
             pytest.skip(f"no BSDS photo in {folder}")
         image, labels = load_image(folder / "image.jpg"), load_labels(folder / "mask.png")
         field = fit(image, labels, 200, recipe="paper", iterations=60, objective="l2", warmup=False).scene.field
-        regions = RegionMap.from_labels(labels, 0.7)
+        regions = RegionMap(labels, 0.7)
         refined = refine_contours(Scene(field, regions), image)
         assert contour_energy(Scene(field, refined), image) < 0.99 * contour_energy(Scene(field, regions), image)
         before, after = (float(psnr(Scene(field, m).render(), image)) for m in (regions, refined))

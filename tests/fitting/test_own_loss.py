@@ -56,7 +56,7 @@ class TestLoss:
         assert float(l1(own.scene()[None]).detach()) == pytest.approx(best, rel=0.02)
 
     def test_without_an_image_the_loss_says_where_gaussians_are_added(self) -> None:
-        regions = RegionMap.from_labels(LABELS, 0.5)
+        regions = RegionMap(LABELS, 0.5)
         result = fit(None, regions, 60, iterations=150, objective=squared, size=(32, 40))
         assert result.scene.num_gaussians > 40 and math.isnan(result.history[-1].psnr)
         assert float(psnr(result.scene().detach(), image())) > 18 and result.scene.regions.num_regions == 2

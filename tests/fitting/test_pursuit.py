@@ -42,7 +42,7 @@ def noise(channels: int, size: tuple[int, int], smooth: int = 3, seed: int = 0) 
 
 def halves(size: tuple[int, int]) -> RegionMap:
     y, x = torch.meshgrid(torch.arange(size[0]), torch.arange(size[1]), indexing="ij")
-    return RegionMap.from_labels(torch.where(x + y // 3 < size[1] // 2, 4, 9))
+    return RegionMap(torch.where(x + y // 3 < size[1] // 2, 4, 9))
 
 
 def tensors(field: GaussianField) -> list[Tensor]:
@@ -144,7 +144,7 @@ class TestProposal:
     @pytest.mark.parametrize("count", [1, 10, 60])
     def test_error_falls(self, count: int, softness: float) -> None:
         residual = noise(3, (60, 72))
-        regions = RegionMap.from_labels(halves((60, 72)).labels, softness)
+        regions = RegionMap(halves((60, 72)).labels, softness)
         left = residual - render(propose(residual, regions, count), regions)
         assert left.square().sum() < residual.square().sum() * (1 - 0.004 * count)
 
@@ -178,7 +178,7 @@ class TestRegions:
     @pytest.mark.parametrize("size", [(40, 52), (33, 17), (5, 7), (1, 9)])
     def test_ids_are_those_under_the_centres(self, size: tuple[int, int]) -> None:
         labels = torch.randint(0, 4, size, generator=torch.Generator().manual_seed(1)) * 3
-        regions = RegionMap.from_labels(labels)
+        regions = RegionMap(labels)
         means, _, _, ids = tensors(propose(noise(3, size, smooth=1), regions, 30))
         assert len(means) > 0
         assert (means > 0).all() and (means < means.new_tensor([size[1], size[0]])).all()
@@ -195,13 +195,13 @@ class TestRegions:
         labels[7, 11] = 5
         residual = torch.zeros(2, 20, 20)
         residual[:, 7, 11] = torch.tensor([0.5, -0.25])
-        means, _, colors, ids = tensors(propose(residual, RegionMap.from_labels(labels), 3))
+        means, _, colors, ids = tensors(propose(residual, RegionMap(labels), 3))
         assert means.tolist() == [[11.5, 7.5]] and ids.tolist() == [5]
         torch.testing.assert_close(colors, torch.tensor([[0.5, -0.25]]))
 
     def test_checkerboard(self) -> None:
         labels = (torch.arange(24)[:, None] + torch.arange(30)) % 2
-        regions = RegionMap.from_labels(labels)
+        regions = RegionMap(labels)
         # a flat error in the white squares alone, which touch at corners only
         residual = (0.5 * labels)[None].float()
         proposal = propose(residual, regions, 180)
@@ -225,7 +225,7 @@ class TestLimits:
         """As many Gaussians as pixels, in several rounds, leave less than half of the error, even of noise."""
         residual = noise(channels, size, smooth=1)
         labels = torch.randint(0, 3, size, generator=torch.Generator().manual_seed(1))
-        for regions in (None, RegionMap.from_labels(labels)):
+        for regions in (None, RegionMap(labels)):
             proposal = propose(residual, regions, size[0] * size[1])
             left = residual - render(proposal, regions)
             assert left.square().sum() < 0.5 * residual.square().sum()

@@ -22,7 +22,7 @@ class RemovalCase:
         self.means = torch.tensor(means, dtype=torch.float32)
         self.cholesky = torch.tensor([2.5, 0.5, 2.0]).repeat(len(means), 1)
         self.colors = torch.tensor(colors)[:, None] * torch.tensor([[1.0, 0.5, -0.25]])
-        self.regions = None if labels is None else RegionMap.from_labels(labels)
+        self.regions = None if labels is None else RegionMap(labels)
         self.ids = None if labels is None else labels[self.means[:, 1].long(), self.means[:, 0].long()]
 
     def render(self, means: Tensor, cholesky: Tensor, colors: Tensor) -> Tensor:
@@ -72,7 +72,7 @@ def test_colours_of_the_others_lower_the_error(softness: float | None) -> None:
     labels = None if softness is None else (torch.arange(60) >= 30).long().expand(SIZE).contiguous()
     scene = RemovalCase(means, torch.randn(120, generator=generator).tolist(), labels)
     if labels is not None:
-        scene.regions = RegionMap.from_labels(labels, softness)
+        scene.regions = RegionMap(labels, softness)
     removed, _, without, error = scene.remove(15)
     assert len(removed) == 15 and error < 0.8 * without
 

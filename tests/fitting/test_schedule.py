@@ -117,13 +117,13 @@ class TestEvents:
 
 class TestMaps:
     def test_moves_are_kept_group_by_group(self) -> None:
-        before = RegionMap.from_labels((torch.arange(30) > 14).long().expand(40, 30).clone())
+        before = RegionMap((torch.arange(30) > 14).long().expand(40, 30).clone())
         labels = before.labels.clone()
         labels[3:6, 15:17] = 0
         labels[30:33, 13:15] = 1
         gain = torch.zeros(40, 30)
         gain[:20], gain[20:] = 1.0, -1.0
-        accepted = accept_moves(before, RegionMap.from_labels(labels), gain).labels
+        accepted = accept_moves(before, RegionMap(labels), gain).labels
         assert torch.equal(accepted[:20], labels[:20])
         assert torch.equal(accepted[20:], before.labels[20:])
 
@@ -134,5 +134,5 @@ class TestMaps:
         after[0, 0] = 1  # elsewhere, where it does not pay
         gain = torch.ones(20, 20)
         gain[:3, :3] = -1.0
-        before = RegionMap.from_labels(labels)
-        assert accept_moves(before, RegionMap.from_labels(after), gain) is before
+        before = RegionMap(labels)
+        assert accept_moves(before, RegionMap(after), gain) is before

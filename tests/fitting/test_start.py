@@ -40,7 +40,7 @@ class TestEvery:
     @pytest.mark.parametrize("count", [1, 40, 500])
     def test_counts_shapes_and_ids(self, name: str, count: int, channels: int) -> None:
         image, labels = scene(channels=channels)
-        regions = RegionMap.from_labels(labels)
+        regions = RegionMap(labels)
         field = START[name](image, count, regions, 0)
         assert field.num_gaussians == count and field.size == (48, 64) and field.colors.shape == (count, channels)
         assert field.region_ids is not None and bool((regions.index_of(field.region_ids) >= 0).all())
@@ -53,31 +53,31 @@ class TestEvery:
     @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
     def test_keeps_the_dtype(self, name: str, dtype: torch.dtype) -> None:
         image, labels = scene()
-        assert START[name](image.to(dtype), 30, RegionMap.from_labels(labels), 0).colors.dtype == dtype
+        assert START[name](image.to(dtype), 30, RegionMap(labels), 0).colors.dtype == dtype
 
     def test_same_seed_same_bits(self, name: str) -> None:
         image, labels = scene()
-        a, b, c = (START[name](image, 60, RegionMap.from_labels(labels), seed) for seed in (2, 2, 3))
+        a, b, c = (START[name](image, 60, RegionMap(labels), seed) for seed in (2, 2, 3))
         for part in ("means", "cholesky", "colors", "region_ids"):
             assert torch.equal(getattr(a, part), getattr(b, part))
         assert not torch.equal(a.means, c.means)
 
     def test_as_many_gaussians_as_pixels(self, name: str) -> None:
         labels = torch.tensor([[0, 0, 5], [0, 9, 9]])
-        field = START[name](torch.rand(2, 2, 3), 6, RegionMap.from_labels(labels), 0)
+        field = START[name](torch.rand(2, 2, 3), 6, RegionMap(labels), 0)
         assert field.num_gaussians == 6 and len(field.means.unique(dim=0)) == 6
 
     def test_parameters_without_graph_under_any_mode(self, name: str) -> None:
         image, labels = scene()
         with torch.no_grad():
-            field = START[name](image, 10, RegionMap.from_labels(labels), 0)
+            field = START[name](image, 10, RegionMap(labels), 0)
         assert all(p.requires_grad and p.is_leaf for p in field.parameters())
 
 
 class TestInitialField:
     def test_has_the_colours_of_the_image(self) -> None:
         image, labels = scene()
-        field = initial_field(image, 400, RegionMap.from_labels(labels), 0)
+        field = initial_field(image, 400, RegionMap(labels), 0)
         x, y = field.means.detach().long().unbind(-1)
         torch.testing.assert_close(field.colors.detach() * (math.pi / 2), image[:, y, x].T)
         assert field.region_ids is not None
@@ -86,12 +86,12 @@ class TestInitialField:
     def test_every_region_has_one(self) -> None:
         image, labels = scene()
         labels[0, 0] = 99
-        field = initial_field(image, 4, RegionMap.from_labels(labels), 0)
+        field = initial_field(image, 4, RegionMap(labels), 0)
         assert field.region_ids is not None and sorted(field.region_ids.tolist()) == [0, 3, 11, 99]
 
     def test_fewer_gaussians_than_regions(self) -> None:
         labels = torch.arange(12).view(3, 4)
-        field = initial_field(torch.full((1, 3, 4), 0.5), 5, RegionMap.from_labels(labels), 0)
+        field = initial_field(torch.full((1, 3, 4), 0.5), 5, RegionMap(labels), 0)
         assert field.num_gaussians == 5
 
     @pytest.mark.parametrize("count", [1, 3])

@@ -25,7 +25,7 @@ def ellipse(scale: int = 1) -> Tensor:
 
 def paint(labels: Tensor, softness: float = 0.0, colors: Tensor = COLORS) -> Tensor:
     """Mix flat colours by the memberships of that softness: the renderer's own definition."""
-    regions = RegionMap.from_labels(labels, softness)
+    regions = RegionMap(labels, softness)
     memberships = torch.stack([regions.membership(region, torch.float32) for region in regions.ids.tolist()])
     return torch.einsum("rhw,rc->chw", memberships, colors)
 

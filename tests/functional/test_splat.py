@@ -178,7 +178,7 @@ class TestRegionSplat(BaseTester):
     def test_feature_soft_membership(self, backend: str) -> None:
         labels = torch.tensor([[0, 0, 0, 1, 1, 1]])
         flat = torch.tensor([[1e6, 0.0, 1e6]])
-        regions = RegionMap.from_labels(labels, softness=0.5)
+        regions = RegionMap(labels, softness=0.5)
         image = region_splat(
             torch.zeros(1, 2), flat, torch.ones(1, 1), torch.tensor([0]), regions, cutoff=0, backend=backend
         )
@@ -196,7 +196,7 @@ class TestRegionSplat(BaseTester):
     @pytest.mark.parametrize("backend", ["reference", "tiled"])
     def test_gradcheck(self, backend: str, regions: int, softness: float) -> None:
         scene = random_scene(5, (9, 19), regions, channels=2)
-        region_map = RegionMap.from_labels(scene.labels, softness)
+        region_map = RegionMap(scene.labels, softness)
 
         def render(means: Tensor, cholesky: Tensor, colors: Tensor) -> Tensor:
             return region_splat(means, cholesky, colors, scene.region_ids, region_map, cutoff=0, backend=backend)
@@ -205,7 +205,7 @@ class TestRegionSplat(BaseTester):
 
     def test_gradients_of_one_argument(self, backend: str) -> None:
         scene = suited(random_scene(20, (20, 30), 2), backend)
-        full = gradients(scene, RegionMap.from_labels(scene.labels), backend=backend)[1]
+        full = gradients(scene, RegionMap(scene.labels), backend=backend)[1]
         for position in range(3):
             inputs = [t.detach().requires_grad_(i == position) for i, t in enumerate(scene[:3])]
             image = region_splat(*inputs, *scene[3:], backend=backend)
@@ -225,7 +225,7 @@ class TestRegionSplat(BaseTester):
     @pytest.mark.parametrize("softness", [0.0, 0.8])
     def test_dynamo(self, backend: str, device: torch.device, dtype: torch.dtype, softness: float) -> None:
         scene = on(device, dtype, random_scene(12, (9, 17), 3))
-        regions = RegionMap.from_labels(scene.labels, softness)
+        regions = RegionMap(scene.labels, softness)
         leaves = [t.requires_grad_() for t in scene[:3]]
 
         def render(*tensors: Tensor) -> Tensor:
@@ -242,7 +242,7 @@ class TestAgainstReference:
     @pytest.mark.parametrize("size", SIZES)
     def test_cutoff_zero(self, backend: str, size: tuple[int, int], regions: int, softness: float) -> None:
         scene = random_scene(60, size, regions)
-        region_map = RegionMap.from_labels(scene.labels, softness)
+        region_map = RegionMap(scene.labels, softness)
         expected, expected_gradients = gradients(scene, region_map, cutoff=0, backend="reference")
         result, result_gradients = gradients(as_float32(scene), region_map, cutoff=0, backend=backend)
         assert result.dtype == torch.float32
@@ -280,7 +280,7 @@ class TestAgainstReference:
     def test_channels_and_long_lists(self, backend: str, count: int, size: tuple[int, int], channels: int) -> None:
         """3000 Gaussians of one tile are more than a segment of the kernels' lists."""
         scene = random_scene(count, size, 3, channels=channels)
-        regions = RegionMap.from_labels(scene.labels)
+        regions = RegionMap(scene.labels)
         expected, expected_gradients = gradients(scene, regions, cutoff=0, backend="reference")
         result, result_gradients = gradients(suited(scene, backend), regions, cutoff=0, backend=backend)
         tolerance = (100 if count > 40 else 10) * rounding(backend)
@@ -340,7 +340,7 @@ class TestConventions:
 
     def test_same_bits_every_time(self, backend: str) -> None:
         scene = as_float32(random_scene(500, (60, 75), 4))
-        region_map = RegionMap.from_labels(scene.labels, 0.7)
+        region_map = RegionMap(scene.labels, 0.7)
         first, second = (gradients(scene, region_map, backend=backend) for _ in range(2))
         assert torch.equal(first[0], second[0])
         assert all(torch.equal(a, b) for a, b in zip(first[1], second[1], strict=True))

@@ -41,7 +41,7 @@ class Parts(NamedTuple):
 
 
 def _regions(p: Parts) -> RegionMap | None:
-    return None if p.labels is None else RegionMap.from_labels(p.labels, p.softness)
+    return None if p.labels is None else RegionMap(p.labels, p.softness)
 
 
 def _scene(p: Parts, metadata: dict[str, str] | None = None) -> Scene:

@@ -41,7 +41,7 @@ def threads() -> Iterator[None]:
 
 def render(scene: tuple[Tensor, ...], softness: float = 0.7) -> list[Tensor]:
     inputs = [t.clone().requires_grad_() for t in scene[:3]]
-    regions = RegionMap.from_labels(scene[4], softness)
+    regions = RegionMap(scene[4], softness)
     image = region_splat(*inputs, scene[3], regions, backend="cpu")
     image.square().sum().backward()
     return [image.detach(), *(t.grad for t in inputs if t.grad is not None)]
@@ -91,7 +91,7 @@ def test_forwards_before_a_backward() -> None:
     alone = [render(each) for each in scenes]
     inputs = [[t.clone().requires_grad_() for t in each[:3]] for each in scenes]
     images = [
-        region_splat(*leaves, each[3], RegionMap.from_labels(each[4], 0.7), backend="cpu")
+        region_splat(*leaves, each[3], RegionMap(each[4], 0.7), backend="cpu")
         for leaves, each in zip(inputs, scenes, strict=True)
     ]
     for k in (1, 0, 2):
@@ -155,7 +155,7 @@ def test_page_faults_and_a_fork() -> None:
 
 @pytest.mark.parametrize("backend", ["cpu", "tiled"])
 def test_one_pass_of_squared_error(scene: tuple[Tensor, ...], backend: str) -> None:
-    regions, target = RegionMap.from_labels(scene[4], 0.7), torch.rand(3, 110, 150, generator=RANDOM)
+    regions, target = RegionMap(scene[4], 0.7), torch.rand(3, 110, 150, generator=RANDOM)
     leaves = [t.clone().requires_grad_() for t in scene[:3]]
     image = region_splat(*leaves, scene[3], regions, backend=backend)
     image.backward(image.detach() - target)

@@ -22,7 +22,7 @@ def differences(got: tuple[Tensor, list[Tensor]], want: tuple[Tensor, list[Tenso
 @pytest.mark.parametrize(("count", "size", "regions"), [(5, (1, 1), 1), (400, (47, 61), 5)])
 def test_float64(count: int, size: tuple[int, int], regions: int, softness: float) -> None:
     scene = random_scene(count, size, regions)
-    region_map = RegionMap.from_labels(scene.labels, softness)
+    region_map = RegionMap(scene.labels, softness)
     got, want = (gradients(scene, region_map, cutoff=0, backend=name) for name in ("tiled", "reference"))
     # memberships are float32
     assert max(differences(got, want)) < (1e-7 if softness else 1e-12)
@@ -31,7 +31,7 @@ def test_float64(count: int, size: tuple[int, int], regions: int, softness: floa
 @pytest.mark.parametrize(("piece", "chunk"), [(1, 1), (3, 5)])
 def test_pieces_and_chunks_change_nothing(piece: int, chunk: int, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = random_scene(50, (47, 61), 5)
-    region_map = RegionMap.from_labels(scene.labels, 0.7)
+    region_map = RegionMap(scene.labels, 0.7)
     want = gradients(scene, region_map, backend="tiled")
     monkeypatch.setattr(tiled, "_PIECE", piece)
     monkeypatch.setattr(tiled, "_CHUNK", chunk)
@@ -43,7 +43,7 @@ def test_pieces_and_chunks_change_nothing(piece: int, chunk: int, monkeypatch: p
 def test_nothing_to_render(count: int, regions: int) -> None:
     scene = random_scene(count, (20, 30), regions)
     scene = scene._replace(means=scene.means + 1e6)
-    image, grads = gradients(scene, RegionMap.from_labels(scene.labels), backend="tiled")
+    image, grads = gradients(scene, RegionMap(scene.labels), backend="tiled")
     assert torch.equal(image, torch.zeros_like(image))
     assert all(torch.equal(gradient, torch.zeros_like(t)) for gradient, t in zip(grads, scene[:3], strict=True))
 
@@ -56,7 +56,7 @@ def test_keys_beyond_32_bits() -> None:
 
 def test_same_bits_on_several_threads() -> None:
     scene = random_scene(5000, (16, 20), 2)  # many pieces of one tile
-    region_map = RegionMap.from_labels(scene.labels, 0.7)
+    region_map = RegionMap(scene.labels, 0.7)
     threads = torch.get_num_threads()
     torch.set_num_threads(4)
     try:

@@ -245,7 +245,7 @@ def small_splat(**changes: Tensor) -> dict[str, Any]:
         "cholesky": torch.tensor([[2.0, 0.0, 2.0], [3.0, 1.0, 2.0]], device=DEVICE),
         "colors": torch.ones(2, 3, device=DEVICE),
         "region_ids": torch.tensor([0, 1], device=DEVICE),
-        "regions": RegionMap.from_labels(labels, 0.7),
+        "regions": RegionMap(labels, 0.7),
     }
     return {**arguments, **changes, "backend": "cuda"}
 
@@ -384,7 +384,7 @@ def test_graph_is_nan_where_lists_do_not_fit(monkeypatch: pytest.MonkeyPatch) ->
 @needs_gpu
 @pytest.mark.filterwarnings("ignore:The CUDA Graph is empty")  # torch's own, at its first graph
 def test_compiled_step() -> None:
-    regions = RegionMap.from_labels((torch.arange(64, device=DEVICE) // 25).expand(48, 64), 0.7)
+    regions = RegionMap((torch.arange(64, device=DEVICE) // 25).expand(48, 64), 0.7)
     field = GaussianField.random(100, (48, 64), regions=regions, seed=0).to(DEVICE)
     target, renderer = torch.rand(1, 3, 48, 64, device=DEVICE), RegionSplatRenderer()
 

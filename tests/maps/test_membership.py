@@ -55,7 +55,7 @@ def blur(labels: Tensor, sigma: Any, region: int) -> Tensor:
 @pytest.mark.parametrize("softness", [0.9, PAIRS], ids=["one", "pairs"])
 def test_definition(softness: Any) -> None:
     labels = blobs(SIZE)
-    membership = membership_of(RegionMap.from_labels(labels, softness))
+    membership = membership_of(RegionMap(labels, softness))
     sigma = width_of_pixels(labels.numpy(), PAIRS) if softness is PAIRS else np.full(labels.shape, softness)
     assert set(np.unique(sigma)) == ({0.0, 0.7, 1.1, 2.0} if softness is PAIRS else {0.9})
     for region in range(4):
@@ -65,17 +65,17 @@ def test_definition(softness: Any) -> None:
 
 def test_contours_without_a_width_are_hard() -> None:
     labels = (torch.arange(60) // 20).expand(20, 60)  # 0 and 2 do not touch
-    assert membership_of(RegionMap.from_labels(labels, {(0, 2): 3.0})).radius == 0
+    assert membership_of(RegionMap(labels, {(0, 2): 3.0})).radius == 0
 
 
 def test_batch_with_a_map_of_one_region() -> None:
     maps = torch.stack([blobs(SIZE), torch.ones(SIZE).long()])
-    membership = membership_of(RegionMap.from_labels(maps, {(0, 1): 0.7, (1, 2): 1.0}))
+    membership = membership_of(RegionMap(maps, {(0, 1): 0.7, (1, 2): 1.0}))
     assert torch.equal(membership.weights(1, 1, torch.float64), torch.ones(SIZE).double())
 
 
 def test_kernels_agree_on_widths_of_pairs() -> None:
-    regions = RegionMap.from_labels(blobs((40, 70), grain=5), PAIRS)
+    regions = RegionMap(blobs((40, 70), grain=5), PAIRS)
     random = torch.rand(60, 8, generator=torch.Generator().manual_seed(3))
     gaussians = random[:, :2] * torch.tensor([70, 40]), 0.5 + 3 * random[:, 2:5], random[:, 5:8]
     results = []

@@ -33,14 +33,14 @@ class TestRegionMap(
     def test_smoke(
         self, device: torch.device, dtype: torch.dtype, softness: float | dict[tuple[int, int], float]
     ) -> None:
-        regions = RegionMap.from_labels(blobs().to(device), softness)
+        regions = RegionMap(blobs().to(device), softness)
         assert regions.labels.device.type == device.type and "4 regions, size=(45, 70)" in repr(regions)
         weights = regions.membership(0, dtype)
         assert weights.dtype == dtype and weights.isfinite().all() and weights.any()
 
     @pytest.mark.parametrize("lead", [(), (1,), (2,)])
     def test_cardinality(self, device: torch.device, lead: tuple[int, ...]) -> None:
-        regions = RegionMap.from_labels(blobs((45, 69)).to(device).expand(*lead, 45, 69))
+        regions = RegionMap(blobs((45, 69)).to(device).expand(*lead, 45, 69))
         assert regions.size == (45, 69) and regions.labels.shape == (*lead, 45, 69) and regions.ids.shape == (4,)
         assert regions.index.shape == (*(lead or (1,)), 45, 69)
         assert not lead or regions[0].labels.shape == (45, 69)
@@ -49,7 +49,7 @@ class TestRegionMap(
     @pytest.mark.parametrize("softness", [0.0, 0.7])
     def test_dynamo(self, device: torch.device, dtype: torch.dtype, softness: float) -> None:
         """A map is made outside of a graph, for the number of its regions is found in values; read inside."""
-        regions, other = (RegionMap.from_labels(blobs(seed=k).to(device), softness) for k in (0, 1))
+        regions, other = (RegionMap(blobs(seed=k).to(device), softness) for k in (0, 1))
 
         def shares(of: RegionMap) -> Tensor:
             return of.labels.to(dtype) / of.num_regions + of.size[0] + of.index_of(of.ids).sum()
@@ -59,14 +59,14 @@ class TestRegionMap(
 
     def test_feature(self, device: torch.device) -> None:
         """Ids need not be consecutive."""
-        regions = RegionMap.from_labels(torch.tensor([[255, 0], [7, 100_000]], device=device))
+        regions = RegionMap(torch.tensor([[255, 0], [7, 100_000]], device=device))
         assert regions.ids.tolist() == [0, 7, 255, 100_000]
         assert regions.num_regions == 4
         assert regions.index_of(torch.tensor([7, 8, 100_000, 0], device=device)).tolist() == [1, -1, 3, 0]
 
     @pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.int32, torch.int64])
     def test_integer_dtypes(self, dtype: torch.dtype) -> None:
-        assert RegionMap.from_labels(torch.tensor([[1, 2]], dtype=dtype)).labels.dtype == torch.int64
+        assert RegionMap(torch.tensor([[1, 2]], dtype=dtype)).labels.dtype == torch.int64
 
     @pytest.mark.parametrize(
         ("labels", "softness", "error", "words"),
@@ -86,7 +86,7 @@ class TestRegionMap(
     )
     def test_exception(self, labels: Tensor, softness: float, error: type[Exception], words: str) -> None:
         with pytest.raises(error, match=words):
-            RegionMap.from_labels(labels, softness)
+            RegionMap(labels, softness)
 
     def test_constructor(self) -> None:
         regions, other = RegionMap(blobs(), 0.7), RegionMap.from_labels(blobs(), 0.7)
@@ -165,15 +165,13 @@ def test_relabel_refuses_an_unknown_word() -> None:
 class TestPairSoftness:
     def test_one_value_for_every_pair_is_a_number(self) -> None:
         labels = torch.tensor([[3, 5, 9]])
-        assert RegionMap.from_labels(labels, {(3, 5): 0.7, (9, 3): 0.7, (5, 9): 0.7}).softness == 0.7
-        assert RegionMap.from_labels(labels, {(3, 5): 0.0}).softness == 0.0
-        assert RegionMap.from_labels(labels, {}).softness == 0.0
-        assert RegionMap.from_labels(torch.ones(2, 2).long(), {}).softness == 0.0
+        assert RegionMap(labels, {(3, 5): 0.7, (9, 3): 0.7, (5, 9): 0.7}).softness == 0.7
+        assert RegionMap(labels, {(3, 5): 0.0}).softness == 0.0
+        assert RegionMap(labels, {}).softness == 0.0
+        assert RegionMap(torch.ones(2, 2).long(), {}).softness == 0.0
 
     def test_merged_regions_have_the_mean_along_their_contours(self) -> None:
-        regions = RegionMap.from_labels(
-            torch.tensor([[1, 2, 3, 4]]), {(1, 2): 0.6, (1, 3): 1.0, (2, 3): 0.5, (3, 4): 0.3}
-        )
+        regions = RegionMap(torch.tensor([[1, 2, 3, 4]]), {(1, 2): 0.6, (1, 3): 1.0, (2, 3): 0.5, (3, 4): 0.3})
         merged, new_ids = regions.merge([(2, 3)])
         assert merged is not None and new_ids.tolist() == [1, 2, 2, 4]
         assert merged.labels.tolist() == [[1, 2, 2, 4]]
@@ -181,7 +179,7 @@ class TestPairSoftness:
 
     def test_read_in_either_order_and_never_written(self) -> None:
         pairs = {(9, 3): 0.7, (3, 5): 1}
-        softness = RegionMap.from_labels(torch.tensor([[3, 5, 9]]), pairs).softness
+        softness = RegionMap(torch.tensor([[3, 5, 9]]), pairs).softness
         assert isinstance(softness, PairSoftness)
         assert list(softness.items()) == [((3, 5), 1.0), ((3, 9), 0.7)]
         assert softness[9, 3] == softness[3, 9] == 0.7 and (5, 9) not in softness
@@ -204,7 +202,7 @@ class TestPairSoftness:
     )
     def test_exception(self, softness: object, error: type[Exception], words: str) -> None:
         with pytest.raises(error, match=words):
-            RegionMap.from_labels(blobs(), softness)  # type: ignore[arg-type]
+            RegionMap(blobs(), softness)  # type: ignore[arg-type]
 
 
 class TestSoftnessOfEachMap:
@@ -332,7 +330,7 @@ def straightness(slope: float, factor: int = 8) -> float:
     """Largest distance, in pixels of the map, of the enlarged contour of a half plane from the line that it is of."""
     y, x = torch.meshgrid(torch.arange(40) + 0.5, torch.arange(96) + 0.5, indexing="ij")
     inside = ((y - 20.1) > slope * (x - 48)).long()
-    large = RegionMap.from_labels(inside).resize((40 * factor, 96 * factor)).membership(1)
+    large = RegionMap(inside).resize((40 * factor, 96 * factor)).membership(1)
     middle = large[:, 24 * factor : 72 * factor]
     crossing = (middle > 0.5).double().argmax(0) / factor
     expected = 20.1 + slope * ((torch.arange(middle.shape[1]) + 0.5) / factor - 24)
@@ -343,20 +341,20 @@ class TestResize:
     def test_labels_and_softness(self) -> None:
         labels = torch.zeros(40, 40).long()
         labels[:, 20:], labels[7, 7] = 1, 2
-        regions = RegionMap.from_labels(labels, {(0, 1): 0.5, (0, 2): 40.0, (1, 2): 1.3})
+        regions = RegionMap(labels, {(0, 1): 0.5, (0, 2): 40.0, (1, 2): 1.3})
         large = regions.resize((120, 120))
         assert torch.equal(large.labels[1::3, 1::3], labels)
         assert large.softness == {(0, 1): 0.5, (0, 2): 64.0, (1, 2): pytest.approx(math.sqrt(9 * 1.44 + 0.25))}
         assert regions.resize((10, 10)).num_regions == 3
         assert large.resize((40, 40)) is regions and large.resize((120, 120)) is large
-        assert RegionMap.from_labels(torch.zeros(4, 5).long()).resize((9, 9)).num_regions == 1
+        assert RegionMap(torch.zeros(4, 5).long()).resize((9, 9)).num_regions == 1
 
     @pytest.mark.parametrize("softness", [0.0, 0.8, {(0, 1): 0.0, (0, 2): 1.1, (1, 2): 2.3}])
     def test_memberships_are_the_stated_ones(self, softness: Any) -> None:
         """For whole maps and in tiles."""
         labels = blobs() % 3
         labels[9, 5:30], labels[20:24, 40], labels[30, 12] = 1, 2, 0
-        regions = RegionMap.from_labels(labels, softness)
+        regions = RegionMap(labels, softness)
         widths = membership_of(regions).variances[0].sqrt()
         weights = stated_weights(labels, widths)
         for size in ((45, 71), (23, 31), (91, 140), (300, 70), (7, 500), (1, 1)):
@@ -371,7 +369,7 @@ class TestResize:
         assert straightness(slope) < 0.2
 
     def test_renders_alike_everywhere(self, backend: str) -> None:
-        regions = RegionMap.from_labels(blobs(), 0.6)
+        regions = RegionMap(blobs(), 0.6)
         field = GaussianField.random(40, (45, 70), regions=regions, seed=0)
         render = RegionSplatRenderer(backend=backend)
         image = render(field, regions, (90, 140))
@@ -381,7 +379,7 @@ class TestResize:
     @pytest.mark.parametrize("size", [(0, 3), (3,), (2.5, 3), "ab", None])
     def test_bad_size(self, size: object) -> None:
         with pytest.raises((ValueError, TypeError), match="size must"):
-            RegionMap.from_labels(blobs()).resize(size)  # type: ignore[arg-type]
+            RegionMap(blobs()).resize(size)  # type: ignore[arg-type]
 
 
 class TestLookup:

@@ -198,7 +198,7 @@ class TestRegionSplatRenderer(BaseTester, without={"test_module": "TestRegionSpl
     def test_gradcheck(self, device: torch.device, labels: Tensor) -> None:
         """At another size, through a soft map."""
         scene = self.scene(device, torch.float32, labels, 4)
-        regions = RegionMap.from_labels(labels.to(device), 0.8)
+        regions = RegionMap(labels.to(device), 0.8)
 
         def draw(*tensors: Tensor) -> Tensor:
             field = GaussianField(*(1 * t for t in tensors), scene.field.region_ids, size=SIZE)
@@ -235,7 +235,7 @@ class TestRegionSplatRenderer(BaseTester, without={"test_module": "TestRegionSpl
         """Means over shares, fractions included: of pixels that are repeated until shares are whole."""
         if softness is None:
             field.region_ids = None
-        scene = Scene(field, None if softness is None else RegionMap.from_labels(labels, softness))
+        scene = Scene(field, None if softness is None else RegionMap(labels, softness))
         rendered = (max(SIZE[0], size[0]), max(SIZE[1], size[1]))
         image = RegionSplatRenderer()(scene, size=rendered).double()
         for dim, side in ((1, size[0]), (2, size[1])):
@@ -268,7 +268,7 @@ class TestRegionSplatRenderer(BaseTester, without={"test_module": "TestRegionSpl
 
 
 def test_tables_made_in_inference_mode_serve_a_later_backward(field: GaussianField, labels: Tensor) -> None:
-    render, regions = RegionSplatRenderer(), RegionMap.from_labels(labels, 0.7)
+    render, regions = RegionSplatRenderer(), RegionMap(labels, 0.7)
     with torch.inference_mode():
         image = render(field, regions)
     assert not image.requires_grad and torch.equal(image, render(field, regions))

@@ -56,7 +56,7 @@ def render(field: GaussianField, regions: RegionMap, cutoff: float = 1e-4) -> Te
 
 
 def one_region(size: tuple[int, int]) -> RegionMap:
-    return RegionMap.from_labels(torch.zeros(size, dtype=torch.int64))
+    return RegionMap(torch.zeros(size, dtype=torch.int64))
 
 
 def blobs(size: tuple[int, int], regions: int, seed: int = 0) -> Tensor:
@@ -116,7 +116,7 @@ class TestAgainstRenderer:
         self, count: int, regions: int, channels: int, size: tuple[int, int], cutoff: float, softness: float
     ) -> None:
         labels = blobs(size, regions, seed=count)
-        field, regions_map = make_field(count, size, labels, channels), RegionMap.from_labels(labels, softness)
+        field, regions_map = make_field(count, size, labels, channels), RegionMap(labels, softness)
         expected = render(field, regions_map, cutoff)
         assert expected.abs().max() > 1e-3
         assert (decode(field, regions_map, cutoff) - expected).abs().max() < ERROR[cutoff]
@@ -164,7 +164,7 @@ class TestAgainstRenderer:
     @pytest.mark.parametrize("regions", [1, 4])
     def test_ids_that_the_map_does_not_hold(self, regions: int) -> None:
         labels = blobs((37, 53), regions)
-        field, regions_map = make_field(60, (37, 53), labels), RegionMap.from_labels(labels)
+        field, regions_map = make_field(60, (37, 53), labels), RegionMap(labels)
         field.region_ids[::2] = 999
         assert (decode(field, regions_map) - render(field, regions_map)).abs().max() < 1e-3
 
@@ -175,7 +175,7 @@ class TestAgainstRenderer:
 
     def test_clamp(self) -> None:
         labels = blobs((37, 53), 3)
-        field, regions = make_field(50, (37, 53), labels, sigma=9.0), RegionMap.from_labels(labels)
+        field, regions = make_field(50, (37, 53), labels, sigma=9.0), RegionMap(labels)
         with torch.no_grad():
             field.colors *= 30.0
         plain = decode(field, regions)
@@ -257,7 +257,7 @@ class TestMemory:
         labels = blobs(size, 6)
         model, data = tmp_path / "generic.onnx", tmp_path / "scene.npz"
         onnx.save(generic_decoder(), model)
-        np.savez(data, **feeds_of(make_field(count, size, labels), RegionMap.from_labels(labels)))
+        np.savez(data, **feeds_of(make_field(count, size, labels), RegionMap(labels)))
         command = [sys.executable, "-c", _MEASURE, str(model), str(data)]
         growth = int(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
         assert growth < 80e6

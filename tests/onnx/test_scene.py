@@ -47,12 +47,12 @@ def scattered(count: int, size: tuple[int, int], regions: RegionMap | None = Non
 def with_regions(kind: str, count: int, size: tuple[int, int], regions: int = 7, channels: int = 3) -> Scene:
     if kind == "none":
         return scattered(count, size, None, channels)
-    return scattered(count, size, RegionMap.from_labels(blobs(size, regions), SOFTNESS[kind]), channels)
+    return scattered(count, size, RegionMap(blobs(size, regions), SOFTNESS[kind]), channels)
 
 
 def one_pixel_regions() -> Scene:
     y, x = torch.meshgrid(*(torch.arange(n) for n in (33, 34)), indexing="ij")
-    scene = scattered(100, (33, 34), RegionMap.from_labels((y + x) % 2))
+    scene = scattered(100, (33, 34), RegionMap((y + x) % 2))
     scene.field.cholesky.data[::2] *= 0.02  # far below a pixel wide
     return scene
 
@@ -304,7 +304,7 @@ def batch() -> Scene:
 
 
 def resized() -> Scene:
-    regions = RegionMap.from_labels(blobs((20, 30), 3), 0.7).resize((40, 60))
+    regions = RegionMap(blobs((20, 30), 3), 0.7).resize((40, 60))
     return scattered(5, (40, 60), regions)
 
 

@@ -58,7 +58,7 @@ class TestDecomposition:
     @pytest.mark.parametrize("size", [SIZE, (77, 101), (33, 41)])
     @pytest.mark.parametrize("softness", [0.0, 0.7, PAIRS])
     def test_maps(self, softness: Any, size: tuple[int, int]) -> None:
-        regions = RegionMap.from_labels(labels_of(SIZE), softness)
+        regions = RegionMap(labels_of(SIZE), softness)
         args = (*gaussians(2, 30, size), *table_and_size(regions)[0], *size, 1e-4, "reference")
         assert_close(decompose(*args), torch.ops.kcgs.region_splat(*args))
 
@@ -86,7 +86,7 @@ class TestDecomposition:
         labels = torch.arange(24)[:, None] // 5 * 8 + torch.arange(36) // 5
         pairs = {(a, b): 0.3 + (7 * a + 3 * b) % 5 / 4 for a in range(40) for b in range(a + 1, 40) if (a + b) % 3}
         ids = set(labels.unique().tolist())
-        regions = RegionMap.from_labels(labels, {p: w for p, w in pairs.items() if set(p) <= ids})
+        regions = RegionMap(labels, {p: w for p, w in pairs.items() if set(p) <= ids})
         means, cholesky, colors, _ = gaussians(1, 40, (24, 36))
         tensors = means, 3 * cholesky, colors, torch.arange(40)[None]
         args = (*tensors, *table_and_size(regions)[0], 24, 36, 1e-4, "reference")
@@ -164,7 +164,7 @@ class TestTorchExport:
 
     @pytest.mark.slow
     def test_a_scene_at_sizes_below_and_above_its_own(self) -> None:
-        regions = RegionMap.from_labels(labels_of(SIZE), PAIRS)
+        regions = RegionMap(labels_of(SIZE), PAIRS)
         module = Resized(Scene(GaussianField.random(40, SIZE, seed=0, regions=regions), regions)).eval()
         program = torch.onnx.export(
             module, (torch.rand(3, 13, 99),), dynamo=True, verbose=False, dynamic_shapes=({1: "H", 2: "W"},)

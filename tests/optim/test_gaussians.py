@@ -15,7 +15,7 @@ SIZE = (24, 40)
 @pytest.mark.parametrize("backend", ["cpu", "tiled"])
 def test_inner_products_are_those_of_rendered_gaussians(backend: str, softness: float | None) -> None:
     labels = (torch.arange(40) >= 18).long().expand(SIZE).contiguous()
-    regions = None if softness is None else RegionMap.from_labels(labels, softness)
+    regions = None if softness is None else RegionMap(labels, softness)
     field = GaussianField.random(30, SIZE, regions=regions, seed=0)
     gaussians = Gaussians.of(field)
     # a channel for each Gaussian alone
@@ -25,7 +25,7 @@ def test_inner_products_are_those_of_rendered_gaussians(backend: str, softness: 
     torch.testing.assert_close(actual, expected, atol=1e-3, rtol=1e-4)
 
 
-@pytest.mark.parametrize("regions", [None, RegionMap.from_labels((torch.arange(40) >= 18).long().expand(SIZE), 0.8)])
+@pytest.mark.parametrize("regions", [None, RegionMap((torch.arange(40) >= 18).long().expand(SIZE), 0.8)])
 def test_weight_sums_are_those_of_rendered_gaussians(regions: RegionMap | None) -> None:
     gaussians, renderer = (
         Gaussians.of(GaussianField.random(30, SIZE, regions=regions, seed=0)),

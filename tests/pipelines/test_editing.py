@@ -38,9 +38,9 @@ def shapes() -> Tensor:
 
 
 MAPS = {
-    "hard": lambda: RegionMap.from_labels(shapes()),
-    "soft": lambda: RegionMap.from_labels(shapes(), 0.8),
-    "pairs": lambda: RegionMap.from_labels(shapes(), {(GROUND, BOX): 1.0, (GROUND, DISC): 0.5}),
+    "hard": lambda: RegionMap(shapes()),
+    "soft": lambda: RegionMap(shapes(), 0.8),
+    "pairs": lambda: RegionMap(shapes(), {(GROUND, BOX): 1.0, (GROUND, DISC): 0.5}),
 }
 
 
@@ -49,7 +49,7 @@ def regions(request: pytest.FixtureRequest) -> RegionMap:
     return MAPS[request.param]()
 
 
-RESIZED = RegionMap.from_labels(shapes(), 0.8).resize((96, 128))
+RESIZED = RegionMap(shapes(), 0.8).resize((96, 128))
 
 
 def scene_of(regions: RegionMap | Tensor, opacities: bool = False) -> Scene:
@@ -429,8 +429,8 @@ class TestReplaceBackground:
         torch.testing.assert_close(hard().detach()[:, outside], other().detach()[:, outside], rtol=0, atol=1e-5)
 
     def test_contours_keep_their_softness(self) -> None:
-        scene = scene_of(RegionMap.from_labels(shapes(), {(GROUND, BOX): 0.5, (GROUND, DISC): 0.9}))
-        halves = RegionMap.from_labels((torch.arange(64) // 32).expand(SIZE), 1.5)
+        scene = scene_of(RegionMap(shapes(), {(GROUND, BOX): 0.5, (GROUND, DISC): 0.9}))
+        halves = RegionMap((torch.arange(64) // 32).expand(SIZE), 1.5)
         result = map_of(replace_background(scene, GROUND, scene_of(halves))).softness
         first = DISC + 1
         assert isinstance(result, PairSoftness) and result[first, first + 1] == 1.5

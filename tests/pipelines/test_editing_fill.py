@@ -62,7 +62,7 @@ def test_hole_is_in_range_and_about_as_steep_as_around(scene: Scene) -> None:
 def test_colours_that_bleed_out_of_the_mask_are_gone() -> None:
     """A mask that is two pixels too small: of the bright object's outline nothing is left."""
     inside = -torch.nn.functional.max_pool2d(-object_mask()[None].float(), 5, 1, 2)[0] > 0
-    regions = RegionMap.from_labels(inside.long())
+    regions = RegionMap(inside.long())
     scene = fit(photo(), regions, 150, iterations=150, move_contours=False).scene
     before, after = (delete_region(scene, 1, fill=f)().detach()[:, ~inside] for f in (False, True))
     assert before.max() > 0.85 and after.max() < 0.75
@@ -110,7 +110,7 @@ def test_move_that_uncovers_nothing_is_not_fitted(scene: Scene) -> None:
 def test_channels_dtypes_opacities_and_soft_maps(channels: int, dtype: torch.dtype) -> None:
     labels = object_mask().long()
     labels[:10] += 4
-    regions = RegionMap.from_labels(labels, {(0, 1): 0.8, (0, 4): 0.4})
+    regions = RegionMap(labels, {(0, 1): 0.8, (0, 4): 0.4})
     field = GaussianField.random(80, SIZE, channels=channels, regions=regions, seed=0, dtype=dtype)
     alpha = torch.linspace(0.2, 1.0, field.num_gaussians, dtype=dtype)
     scene = Scene(GaussianField(field.means, field.cholesky, field.colors, field.region_ids, alpha, size=SIZE), regions)

@@ -95,7 +95,7 @@ def test_trains_through_the_renderer() -> None:
     torch.manual_seed(0)
     encoder = Encoder()
     images, labels = draw_shapes(0)
-    regions = RegionMap.from_labels(labels, 0.7)
+    regions = RegionMap(labels, 0.7)
     optimizer = torch.optim.Adam(encoder.parameters(), lr=5e-3)
     losses = []
     for step in range(60):

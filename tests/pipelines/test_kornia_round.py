@@ -102,7 +102,7 @@ class TestFirstLink:
     def scene(self) -> Scene:
         labels = torch.zeros(self.SIZE, dtype=torch.long)
         labels[6:18, 10:30] = 4
-        regions = RegionMap.from_labels(labels, 0.7)
+        regions = RegionMap(labels, 0.7)
         return Scene(GaussianField.random(60, self.SIZE, regions=regions, seed=0), regions)
 
     @pytest.mark.parametrize("link", LINKS)

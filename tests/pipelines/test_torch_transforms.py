@@ -39,7 +39,7 @@ def compiler_warnings(test: Callable[..., None]) -> Callable[..., None]:
 def regions() -> RegionMap:
     labels = torch.zeros(SIZE, dtype=torch.long)
     labels[6:18, 10:26] = 3
-    return RegionMap.from_labels(labels, 0.8)
+    return RegionMap(labels, 0.8)
 
 
 @pytest.fixture
@@ -126,7 +126,7 @@ class TestCompile:
         compiled = torch.compile(region_splat, backend="aot_eager", fullgraph=True, dynamic=True)
         for batch, count in ((2, 3), (3, 7), (2, 2)):
             labels = (torch.arange(SIZE[1]) > 5 + torch.arange(batch)[:, None, None]).long().expand(-1, *SIZE)
-            regions = RegionMap.from_labels(labels, softness)
+            regions = RegionMap(labels, softness)
             field = GaussianField.stack(
                 [GaussianField.random(count, SIZE, regions=labels[k], seed=k) for k in range(batch)]
             )
@@ -164,7 +164,7 @@ class TestCompile:
         options = {"force_parameter_static_shapes": False, "force_nn_module_property_static_shapes": False}
         for count in (20, 12, 30):
             for softness in (1.1, 1.6):
-                regions = RegionMap.from_labels((torch.arange(SIZE[1]) > count).long().expand(SIZE), softness)
+                regions = RegionMap((torch.arange(SIZE[1]) > count).long().expand(SIZE), softness)
                 field = GaussianField.random(count, SIZE, regions=regions, seed=0)
                 if predicted:  # buffers, part of a graph
                     tensors = (1 * p for p in field.parameters())
@@ -263,7 +263,7 @@ class TestOperator:
         """Two renders of the same tensors before the first backward: each has the gradient of its own contours."""
         labels = torch.zeros(SIZE, dtype=torch.long)
         labels[:, 16:] = 3
-        maps = [RegionMap.from_labels(labels, softness) for softness in (0.4, 4.0)]
+        maps = [RegionMap(labels, softness) for softness in (0.4, 4.0)]
         tensors = [t.detach()[None].clone() for t in (field.means, field.cholesky, field.colors)]
         tensors[2].requires_grad_()
         ids = field.region_ids[None]
@@ -284,7 +284,7 @@ class TestOperator:
         array[:, 16:] = 3
         with torch.inference_mode(write == "inference"):
             labels = torch.from_numpy(array) if write in ("numpy", "data") else torch.from_numpy(array).clone()
-            regions, ids = RegionMap.from_labels(labels), torch.zeros_like(field.region_ids)
+            regions, ids = RegionMap(labels), torch.zeros_like(field.region_ids)
             before = region_splat(*gaussians, ids, labels)
             if write == "numpy":
                 array[:] = array[:, ::-1].copy()

@@ -120,7 +120,7 @@ class TestLossesFall:
     def test_compiled_with_its_loss(self) -> None:
         """One graph of render and loss, with a map that has soft contours."""
         image, field, renderer = target(), initial_field(target(), 40, halves()), RegionSplatRenderer(keepdim=False)
-        regions = RegionMap.from_labels(halves(), softness=0.7)
+        regions = RegionMap(halves(), softness=0.7)
         error = torch.compile(lambda: LOSSES["L1"](renderer(field, regions), image), fullgraph=True, backend="eager")
         losses = descend(GaussianAdam(field), error)
         assert losses[-1] < 0.6 * losses[0]

@@ -74,7 +74,7 @@ class TestCompress:
         expected = compress(scene, image, quality=30, iterations=3).data
         with mode():
             copy = GaussianField(field.means, field.cholesky, field.colors, field.region_ids, size=field.size)
-            other = Scene(copy, RegionMap.from_labels(scene.regions.labels))
+            other = Scene(copy, RegionMap(scene.regions.labels))
             assert compress(other, image.clone(), quality=30, iterations=3)
             assert compress(scene, image, quality=30, iterations=3).data == expected
 
