@@ -75,7 +75,7 @@ def fit_command(
         report["region_report"] = None if regions_report is None else asdict(regions_report)
     print_report(report, as_json, str(output))
     if regions_report is not None and not as_json:
-        is_lost = regions_report.num_after == 1 < regions_report.num_before and regions_report.dropped != "recipe"
+        is_lost = regions_report.num_before > 1 == regions_report.num_after and regions_report.dropped != "recipe"
         typer.echo(f"regions: {regions_report}{'. --keep-contours keeps them' if is_lost else ''}")
     if labels is None and regions == "auto" and not as_json:
         typer.echo(f"regions: none, for a side is below {options.LEAST_SIDE} pixels")

@@ -10,7 +10,7 @@ import numpy as np
 from kcgs.compiled.program import Program, inner
 from kcgs.compiled.tasks import first_task, next_task
 
-from .tile import TILE as SIDE
+from .tile import TILE
 
 program = Program("tables of label maps")
 
@@ -69,16 +69,16 @@ def list_regions(index, width_index, reaches, num_regions):
     of each width; `width_index` is empty where there is one width.
     """
     maps, height, width = index.shape
-    rows, cols = (height + SIDE - 1) // SIDE, (width + SIDE - 1) // SIDE
+    rows, cols = (height + TILE - 1) // TILE, (width + TILE - 1) // TILE
     counts, regions = np.empty(maps * rows * cols, np.int64), np.empty(maps * rows * cols + 1, np.int32)
     tiles = np.full(num_regions, -1)  # last tile that was found to hold each region
     end = 0
     for t in range(len(counts)):
-        image, top, left = t // (rows * cols), t // cols % rows * SIDE, t % cols * SIDE
+        image, top, left = t // (rows * cols), t // cols % rows * TILE, t % cols * TILE
         reach = reaches[_widest(width_index[image], top, left) if len(width_index) else 0]
         first, last = end, -1
-        left, right = max(left - reach, 0), min(left + SIDE + reach, width)
-        for y in range(max(top - reach, 0), min(top + SIDE + reach, height)):
+        left, right = max(left - reach, 0), min(left + TILE + reach, width)
+        for y in range(max(top - reach, 0), min(top + TILE + reach, height)):
             for x in range(left, right):
                 region = index[image, y, x]
                 if region == last:
@@ -105,15 +105,15 @@ def list_window_regions(starts, regions, shape, places, span, num_regions):
         span: height and width of a window.
         num_regions: of the map.
     """
-    rows, cols = (shape[1] + SIDE - 1) // SIDE, (shape[2] + SIDE - 1) // SIDE
+    rows, cols = (shape[1] + TILE - 1) // TILE, (shape[2] + TILE - 1) // TILE
     counts, entries = np.empty(len(places), np.int64), np.empty(len(places) + 1, np.int32)
     windows = np.full(num_regions, -1)
     end = 0
     for t in range(len(places)):
         image, top, left = places[t]
         first = end
-        for row in range(max(top // SIDE, 0), min((top + span[0] - 1) // SIDE + 1, rows)):
-            for col in range(max(left // SIDE, 0), min((left + span[1] - 1) // SIDE + 1, cols)):
+        for row in range(max(top // TILE, 0), min((top + span[0] - 1) // TILE + 1, rows)):
+            for col in range(max(left // TILE, 0), min((left + span[1] - 1) // TILE + 1, cols)):
                 tile = (image * rows + row) * cols + col
                 for entry in range(starts[tile], starts[tile + 1]):
                     if windows[regions[entry]] != t:
@@ -145,19 +145,19 @@ def cut_windows(tiles, shape, places, members, windows, tasks, counters):
     ranges of windows.
     """
     starts, regions, planes, weights = tiles
-    rows, cols = (shape[1] + SIDE - 1) // SIDE, (shape[2] + SIDE - 1) // SIDE
+    rows, cols = (shape[1] + TILE - 1) // TILE, (shape[2] + TILE - 1) // TILE
     height, width = windows.shape[1:]
     task = first_task(tasks, counters)
     while task >= 0:
         for p in range(tasks[task, 1], tasks[task, 2]):
             image, top, left = places[p]
             windows[p] = 0.0
-            for row in range(max(top // SIDE, 0), min((top + height - 1) // SIDE + 1, rows)):
-                for col in range(max(left // SIDE, 0), min((left + width - 1) // SIDE + 1, cols)):
+            for row in range(max(top // TILE, 0), min((top + height - 1) // TILE + 1, rows)):
+                for col in range(max(left // TILE, 0), min((left + width - 1) // TILE + 1, cols)):
                     tile = (image * rows + row) * cols + col
                     for entry in range(starts[tile], starts[tile + 1]):
                         if regions[entry] == members[p]:
-                            _copy_plane(planes[entry], weights, row * SIDE - top, col * SIDE - left, windows[p])
+                            _copy_plane(planes[entry], weights, row * TILE - top, col * TILE - left, windows[p])
         task = next_task(tasks, counters, task)
 
 
@@ -165,9 +165,9 @@ def cut_windows(tiles, shape, places, members, windows, tasks, counters):
 def _copy_plane(plane, weights, top, left, window):
     """Copy the part of a tile that lies in a window."""
     height, width = window.shape
-    for y in range(max(top, 0), min(top + SIDE, height)):
-        for x in range(max(left, 0), min(left + SIDE, width)):
-            window[y, x] = weights[plane, (y - top) * SIDE + x - left] if plane >= 0 else 1.0
+    for y in range(max(top, 0), min(top + TILE, height)):
+        for x in range(max(left, 0), min(left + TILE, width)):
+            window[y, x] = weights[plane, (y - top) * TILE + x - left] if plane >= 0 else 1.0
 
 
 @program.entry
@@ -181,12 +181,12 @@ def fill_planes(index, smooth, blurs, tiles, tasks, counters):
     """
     (width_index, taps), (starts, regions, planes, weights) = blurs, tiles
     _, height, width = index.shape
-    rows, cols = (height + SIDE - 1) // SIDE, (width + SIDE - 1) // SIDE
-    side = SIDE + 2 * (taps.shape[1] - 1)
+    rows, cols = (height + TILE - 1) // TILE, (width + TILE - 1) // TILE
+    side = TILE + 2 * (taps.shape[1] - 1)
     labels, others = np.empty((side, side), np.int32), np.empty((side, side), np.int32)
     own_shares, other_shares = np.empty((side, side)), np.empty((side, side))
-    member, blurred = np.empty(side), np.empty((side, SIDE))
-    is_empty, total = np.empty(side, np.bool_), np.empty((SIDE, SIDE))
+    member, blurred = np.empty(side), np.empty((side, TILE))
+    is_empty, total = np.empty(side, np.bool_), np.empty((TILE, TILE))
     is_smooth = len(smooth[0]) > 0
     task = first_task(tasks, counters)
     while task >= 0:
@@ -194,8 +194,8 @@ def fill_planes(index, smooth, blurs, tiles, tasks, counters):
             first, end = starts[tile], starts[tile + 1]
             if end - first < 2:
                 continue
-            image, top, left = tile // (rows * cols), tile // cols % rows * SIDE, tile % cols * SIDE
-            if side == SIDE:
+            image, top, left = tile // (rows * cols), tile // cols % rows * TILE, tile % cols * TILE
+            if side == TILE:
                 _read(index[image], top, left, side, -1, labels)
                 for entry in range(first, end):
                     _mark_members(labels.ravel(), regions[entry], weights[planes[entry]])
@@ -206,13 +206,13 @@ def fill_planes(index, smooth, blurs, tiles, tasks, counters):
                 half = taps[k, : np.count_nonzero(taps[k])]
                 n = len(half) - 1
                 down, across = _sum_inside(half, top, height), _sum_inside(half, left, width)
-                _read(index[image], top - n, left - n, SIDE + 2 * n, -1, labels)
+                _read(index[image], top - n, left - n, TILE + 2 * n, -1, labels)
                 if is_smooth:
-                    _read(smooth[0][image], top - n, left - n, SIDE + 2 * n, 0, own_shares)
-                    _read(smooth[1][image], top - n, left - n, SIDE + 2 * n, -1, others)
-                    _read(smooth[2][image], top - n, left - n, SIDE + 2 * n, 0, other_shares)
+                    _read(smooth[0][image], top - n, left - n, TILE + 2 * n, 0, own_shares)
+                    _read(smooth[1][image], top - n, left - n, TILE + 2 * n, -1, others)
+                    _read(smooth[2][image], top - n, left - n, TILE + 2 * n, 0, other_shares)
                 for entry in range(first, end):
-                    for y in range(SIDE + 2 * n):
+                    for y in range(TILE + 2 * n):
                         if is_smooth:
                             _share(labels[y], own_shares[y], others[y], other_shares[y], regions[entry], member)
                             count = np.count_nonzero(member)
@@ -240,7 +240,7 @@ def _read(image, top, left, side, outside, square):
 @inner
 def _mark_members(labels, region, weights):
     """Fill the weights of a tile with hard contours."""
-    for k in range(SIDE * SIDE):
+    for k in range(TILE * TILE):
         weights[k] = labels[k] == region
 
 
@@ -266,11 +266,11 @@ def _share(labels, own_shares, others, other_shares, region, member):
 def _blur(half, line, blurred):
     """Blur a line to the pixels of a tile."""
     n = len(half) - 1
-    for x in range(SIDE):
+    for x in range(TILE):
         blurred[x] = 0.0
     for t in range(2 * n + 1):
         tap = half[abs(t - n)]
-        for x in range(SIDE):
+        for x in range(TILE):
             blurred[x] += tap * line[x + t]
 
 
@@ -278,21 +278,21 @@ def _blur(half, line, blurred):
 def _blur_rows(half, rows, is_empty, blurred):
     """Blur the rows of a tile's window to the rows of the tile."""
     n = len(half) - 1
-    for y in range(SIDE):
+    for y in range(TILE):
         total = blurred[y]
-        for x in range(SIDE):
+        for x in range(TILE):
             total[x] = 0.0
         for t in range(2 * n + 1):
             if not is_empty[y + t]:
                 tap, row = half[abs(t - n)], rows[y + t]
-                for x in range(SIDE):
+                for x in range(TILE):
                     total[x] += tap * row[x]
 
 
 @inner
 def _divide(total, down, across):
-    for y in range(SIDE):
-        for x in range(SIDE):
+    for y in range(TILE):
+        for x in range(TILE):
             total[y, x] /= max(down[y] * across[x], 1e-300)
 
 
@@ -300,19 +300,19 @@ def _divide(total, down, across):
 def _copy_pixels(total, width_index, k, place, weights):
     """Copy the pixels of width k; all pixels where there is one width."""
     image, top, left = place
-    for y in range(SIDE):
-        for x in range(SIDE):
+    for y in range(TILE):
+        for x in range(TILE):
             if not len(width_index) or _width(width_index[image], top + y, left + x) == k:
-                weights[y * SIDE + x] = total[y, x]
+                weights[y * TILE + x] = total[y, x]
 
 
 @inner
 def _sum_inside(half, first, length):
     """Return for each pixel of a tile the sum of the taps around it that lie within the image along an axis."""
-    line = np.zeros(SIDE + 2 * len(half) - 2)
+    line = np.zeros(TILE + 2 * len(half) - 2)
     begin = len(half) - 1 - first
     line[max(begin, 0) : max(begin + length, 0)] = 1.0
-    sums = np.empty(SIDE)
+    sums = np.empty(TILE)
     _blur(half, line, sums)
     return sums
 
@@ -325,8 +325,8 @@ def _width(width_index, row, col):
 
 @inner
 def _has_width(width_index, k, top, left):
-    for y in range(top, top + SIDE):
-        for x in range(left, left + SIDE):
+    for y in range(top, top + TILE):
+        for x in range(left, left + TILE):
             if _width(width_index, y, x) == k:
                 return True
     return False
@@ -336,7 +336,7 @@ def _has_width(width_index, k, top, left):
 def _widest(width_index, top, left):
     """Return the largest width of a tile."""
     widest = 0
-    for y in range(top, min(top + SIDE, width_index.shape[0])):
-        for x in range(left, min(left + SIDE, width_index.shape[1])):
+    for y in range(top, min(top + TILE, width_index.shape[0])):
+        for x in range(left, min(left + TILE, width_index.shape[1])):
             widest = max(widest, width_index[y, x])
     return widest

@@ -28,8 +28,8 @@ _TASK_WINDOWS = 32
 _CHUNK_PIXELS = 1 << 21
 # least blur of antialiased labels, in pixels of the map
 LEAST_BLUR = 0.7
-# squared width of a pixel: it counts as a standard deviation of half a pixel
-PIXEL = 1 / 4
+# variance that the finite width of a pixel adds: a standard deviation of half a pixel
+PIXEL_VARIANCE = 1 / 4
 
 
 class SmoothMembership(Membership):
@@ -198,13 +198,13 @@ def _read(pixels: Tensor, places: Tensor, span: Sequence[int]) -> Tensor:
 
 def contour_variance(variance: Numbers, ratio: float | Numbers) -> Numbers:
     """Convert the squared width of a contour from pixels of the map to pixels of the new size."""
-    return (variance - PIXEL).clamp_min(0) * ratio + PIXEL
+    return (variance - PIXEL_VARIANCE).clamp_min(0) * ratio + PIXEL_VARIANCE
 
 
 def sharpness(variance: Numbers, ratio: float | Numbers) -> Numbers:
     """Evaluate the exponent e of :class:`Resampled` for squared widths in pixels of the map; `ratio` is its s."""
     new_variance = contour_variance(variance, ratio)
-    blurred = variance.clamp_min(LEAST_BLUR**2) + PIXEL  # variance after antialiasing and interpolation
+    blurred = variance.clamp_min(LEAST_BLUR**2) + PIXEL_VARIANCE  # variance after antialiasing and interpolation
     return (blurred * ratio / new_variance).sqrt()
 
 

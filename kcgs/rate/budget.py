@@ -41,14 +41,16 @@ class GaussianBudget:
     """
 
     bits_per_gaussian: float = 25.2
-    """Bits of the file per Gaussian of the fit, at `reference_count`. More: fewer Gaussians, each rounded less."""
+    """Bits of the file per Gaussian of the fit, by the slope at `reference_count`. More: fewer Gaussians, each rounded
+    less."""
     reference_count: int = 2100
-    """Number of Gaussians for which `bits_per_gaussian` holds: a file of 6,700 bytes."""
+    """Number of Gaussians at which the slope has `bits_per_gaussian`."""
     bits_per_doubling: float = 1.9
-    """Increase of the bits per Gaussian for each doubling of the number of Gaussians. More: small files get more
-    Gaussians, large files fewer."""
+    """Slope: increase of the bits per Gaussian for each doubling of the number of Gaussians. More: large files get
+    fewer Gaussians."""
     min_bits_per_gaussian: float = 26.0
-    """Least bits per Gaussian; with the other defaults they hold for up to 2,800 Gaussians."""
+    """Least bits per Gaussian. With the other defaults files of up to 2,800 Gaussians have these, and larger files the
+    bits of the slope."""
     header_bytes: int = 30
     """Bytes of a file besides Gaussians and map."""
     least_spacing: float = math.inf
