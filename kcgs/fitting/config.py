@@ -71,7 +71,11 @@ class FitConfig(BaseModel):
     warmup: bool = Field(
         False, description="in the first half of the iterations, Gaussians take the region ids under their centres"
     )
-    prune: float = Field(1e-3, ge=0.0, description="remove Gaussians that change no value by more, at the end; 0: none")
+    prune: float = Field(
+        1e-3,
+        ge=0.0,
+        description="at the end, remove Gaussians that change no value of the image by more than this; 0: none",
+    )
 
     # Contours
     move_contours: bool = Field(True, description="let contours leave the user's map")

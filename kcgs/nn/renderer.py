@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from kcgs._check import check_cutoff, check_size
 from kcgs._sizes import is_equal
 from kcgs.functional import RegionMap, splat_at
+from kcgs.kernels import check_backend
 from kcgs.maps import table_and_size
 
 from .field import GaussianField
@@ -36,7 +37,7 @@ class RegionSplatRenderer(nn.Module):
         keepdim: give (C, H, W) for an unbatched field; False: always (B, C, H, W), as Kornia's modules take it.
 
     Raises:
-        ValueError: cutoff out of range.
+        ValueError: cutoff out of range; an unknown backend.
 
     Example:
         >>> field = GaussianField.random(10, (32, 48), seed=0)
@@ -48,7 +49,7 @@ class RegionSplatRenderer(nn.Module):
         super().__init__()
         self.cutoff = check_cutoff(cutoff)
         self.clamp = clamp
-        self.backend = backend
+        self.backend = check_backend(backend)
         self.keepdim = keepdim
 
     def forward(

@@ -36,8 +36,6 @@ _FINAL_ITERATIONS = 20
 _CONTOUR_ITERATION = 30
 # factor by which a move of a contour may raise the squared error around it: Gaussians adapt to it afterwards
 _MAX_RISE = 1.5
-# least standard deviation of a Gaussian, in pixels
-_MIN_SIGMA = 0.5
 # weight of the error of a row that may not move, so large that the row is never relocated
 _FIXED_WEIGHT = 1e9
 # usual sum of the weights of all Gaussians at a pixel; where the sum is larger, steps are shorter
@@ -67,7 +65,7 @@ class FrameDescent(NewtonDescent):
     ) -> None:
         assert config.objective is not None
         objective = OBJECTIVES[config.objective](image)
-        super().__init__(Gaussians.of(scene.field), objective, renderer_of(scene, config), min_sigma=_MIN_SIGMA)
+        super().__init__(Gaussians.of(scene.field), objective, renderer_of(scene, config), min_sigma=config.min_sigma)
         self.image, self.start, self.config = image, scene, config
         self.movable_rows, self.changed_pixels = movable_rows, changed_pixels
         self.overlap = torch.ones_like(self.gaussians.means[:, 0])

@@ -73,7 +73,8 @@ def fit_video(
         label_maps: one map for each frame; or one map of the first frame, :math:`(H, W)`, which moves with the image
             until a scene cut and then becomes one region. None: one region.
         num_gaussians: N of every frame; None: one per 100 pixels, at least 100.
-        recipe: of the first frame, and of the first frame after a scene cut.
+        recipe: of the first frame, and of the first frame after a scene cut. Other frames have 85 iterations of another
+            descent, with the objective, cutoff, backend, `min_sigma` and moves of contours of these settings.
         seed: of the random start.
         on_frame: called with the number of every frame, from 0, and its scene; returning True ends the fit.
         progress: show the number of fitted frames.

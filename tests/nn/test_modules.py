@@ -256,6 +256,8 @@ class TestRegionSplatRenderer(BaseTester, without={"test_module": "TestRegionSpl
             render(labels)
         with pytest.raises(ValueError, match="cutoff must be in"):
             RegionSplatRenderer(cutoff=2.0)
+        with pytest.raises(ValueError, match="backend must be one of auto, reference, tiled, cpu, cuda; got 'gpu'"):
+            RegionSplatRenderer(backend="gpu")
 
     def test_a_map_that_lacks_ids(self, field: GaussianField, labels: Tensor) -> None:
         other = torch.where(labels == 4, 99, labels)

@@ -117,6 +117,12 @@ class TestFitVideo:
         frames = torch.rand(2, 3, *size, generator=torch.Generator().manual_seed(0))
         assert fit_video(frames, None, 3, iterations=5).render().shape == (2, 3, *size)
 
+    def test_all_frames_have_the_least_width(self) -> None:
+        scenes = fit_video(FRAMES[:2], None, 20, iterations=20, min_sigma=2.0)
+        l11, l21, l22 = scenes.field.cholesky[1].detach().unbind(-1)
+        factors = torch.stack([l11, torch.zeros_like(l11), l21, l22], -1).view(-1, 2, 2)
+        assert torch.linalg.svdvals(factors).min() > 1.999
+
     def test_bounded(self) -> None:
         with pytest.raises(ValueError, match="bounded must be False for a video; got True"):
             fit_video(FRAMES, None, 8, iterations=2, bounded=True)
