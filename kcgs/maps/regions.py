@@ -197,10 +197,8 @@ class RegionMap:
     def relabel(self, labels: Tensor, new_contours: Literal["hard", "mean"] = "hard") -> RegionMap:
         r"""Make the map of other labels, with the softness of this map; pairs whose ids remain keep theirs.
 
-        A resized map becomes a plain map: its contours are those of the given labels.
-
         Args:
-            labels: integer, the shape of `labels`.
+            labels: integer, the shape of `labels`; the contours are those of these labels, also for a resized map.
             new_contours: softness of pairs that touch only in the new map and have none: 0 ("hard"), or the mean over
                 all pairs ("mean"). Ignored where all contours have one softness.
 
