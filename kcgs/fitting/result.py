@@ -54,7 +54,7 @@ class FitResult(NamedTuple):
     regions: RegionReport | list[RegionReport] | None = None
     """What became of the label map, or of the map of each image of a batch; None without a map."""
     seconds: float = 0.0
-    """Wall time from the start to the pruned scene, of all fits of a search. No compilation with `max_seconds`."""
+    """Wall time of the fit, or of all fits of a search, with pruning; `max_seconds` does not count compilation."""
     psnr: float | Tensor = math.nan
     """PSNR of the scene before pruning, in dB; (B,) on the CPU for a batch; NaN without an image."""
 

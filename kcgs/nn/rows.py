@@ -39,6 +39,16 @@ def join(first: GaussianField, second: GaussianField) -> GaussianField:
     return GaussianField(means, cholesky, concatenate(first.colors, second.colors), ids, opacities, size=first.size)
 
 
+def clear_lost_rows(field: GaussianField, regions: RegionMap) -> GaussianField:
+    """Make the rows of regions that a map lacks unused, without the graph: colour 0, and the map's first region."""
+    if field.region_ids is None:
+        return field
+    is_present = torch.isin(field.region_ids, regions.ids)
+    ids, colors = torch.where(is_present, field.region_ids, regions.ids[0]), field.colors.detach()
+    colors = torch.where(is_present[..., None], colors, 0.0)
+    return GaussianField(field.means.detach(), field.cholesky.detach(), colors, ids, field.opacities, size=field.size)
+
+
 def pad_rows(field: GaussianField, count: int, regions: RegionMap | None = None) -> GaussianField:
     """Pad a field with black Gaussians to `count` per image, without the graph; opacities are merged into the colours.
 

@@ -41,16 +41,15 @@ class GaussianBudget:
     """
 
     bits_per_gaussian: float = 25.2
-    """Bits of the file per Gaussian of the fit, by the slope at `reference_count`. More: fewer Gaussians, each rounded
-    less."""
+    """Bits of the file per Gaussian of the fit, at `reference_count` Gaussians and without the least number of bits.
+    More: fewer Gaussians, each rounded less."""
     reference_count: int = 2100
-    """Number of Gaussians at which the slope has `bits_per_gaussian`."""
+    """Number of Gaussians for which `bits_per_gaussian` holds."""
     bits_per_doubling: float = 1.9
-    """Slope: increase of the bits per Gaussian for each doubling of the number of Gaussians. More: large files get
-    fewer Gaussians."""
+    """Increase of the bits per Gaussian for each doubling of the number of Gaussians. More: large files get fewer
+    Gaussians."""
     min_bits_per_gaussian: float = 26.0
-    """Least bits per Gaussian. With the other defaults files of up to 2,800 Gaussians have these, and larger files the
-    bits of the slope."""
+    """Least bits per Gaussian. With the other defaults they hold for up to 2,800 Gaussians."""
     header_bytes: int = 30
     """Bytes of a file besides Gaussians and map."""
     least_spacing: float = math.inf

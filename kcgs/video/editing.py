@@ -11,13 +11,13 @@ from kcgs.compiled import threads_for_kernels
 from kcgs.editing import check_offset, shift_labels, unique_region_ids, warn_of_lost_regions
 from kcgs.fitting import FitConfig, config_for
 from kcgs.functional import RegionMap
-from kcgs.nn import GaussianField, join
+from kcgs.nn import GaussianField, clear_lost_rows, join
 from kcgs.optim import Gaussians
 from kcgs.scene import Scene, check_batch
 
 from .background import affine_motions, apply_affine, restore_background
 from .descent import FrameDescent
-from .stacking import clear_lost_rows, stack
+from .stacking import stack
 
 
 @torch.inference_mode(False)
@@ -110,8 +110,7 @@ def move_in_video(scenes: Scene, region_ids: int | Iterable[int], offset: Sequen
     labels = shift_labels(regions.labels, torch.isin(regions.labels, ids), steps, background.regions.labels)[1]
     warn_of_lost_regions(regions, labels)
     new_regions = regions.relabel(labels, "mean")
-    gaussians = clear_lost_rows(Gaussians.of(join(background.field, region_field)), new_regions)
-    return Scene(gaussians.field(scenes.size), new_regions, scenes.metadata)
+    return Scene(clear_lost_rows(join(background.field, region_field), new_regions), new_regions, scenes.metadata)
 
 
 def _check(scenes: Scene, region_ids: int | Iterable[int]) -> tuple[RegionMap, Tensor, Tensor]:

@@ -18,14 +18,14 @@ from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
 from kcgs.fitting import FitConfig, check_image_and_regions, check_num_gaussians, config_for, fit
 from kcgs.functional import RegionMap, lookup_regions
-from kcgs.nn import pad_rows
+from kcgs.nn import clear_lost_rows, pad_rows
 from kcgs.optim import Gaussians
 from kcgs.scene import Scene
 
 from .descent import FrameDescent, renderer_of
 from .files import DEFAULT_FRAME_RATE
 from .flow import move_labels, move_points, optical_flow
-from .stacking import clear_lost_rows, stack
+from .stacking import stack
 
 OnFrame = Callable[[int, Scene], bool | None]
 Labels = RegionMap | Tensor | NDArray[Any]
@@ -73,8 +73,9 @@ def fit_video(
         label_maps: one map for each frame; or one map of the first frame, :math:`(H, W)`, which moves with the image
             until a scene cut and then becomes one region. None: one region.
         num_gaussians: N of every frame; None: one per 100 pixels, at least 100.
-        recipe: of the first frame, and of the first frame after a scene cut. Other frames have 85 iterations of another
-            descent, with the objective, cutoff, backend, `min_sigma` and moves of contours of these settings.
+        recipe: of the first frame, and of the first frame after a scene cut. Other frames have a
+            shorter descent of their own, which takes the objective, cutoff, backend, `min_sigma` and the settings of
+            contours.
         seed: of the random start.
         on_frame: called with the number of every frame, from 0, and its scene; returning True ends the fit.
         progress: show the number of fitted frames.
@@ -87,7 +88,7 @@ def fit_video(
     Raises:
         TypeError: wrong types.
         ValueError: as :func:`kcgs.fit`; an objective that is neither l2 nor ms-ssim, such as a recipe's; `bounded`; no
-            frames; a frame of another size; as many label maps as frames are wanted, or one.
+            frames; a frame of another size; several label maps, but not one for each frame.
 
     Example:
         >>> frames = [torch.zeros(3, 16, 24) for _ in range(3)]
@@ -175,9 +176,8 @@ class _VideoFit:
 
         A pixel changed if the unmoved Gaussians have a larger error around it than when they were fitted.
         """
-        still = Gaussians.of(self.frames[-1].field)
-        if regions is not None:
-            still = clear_lost_rows(still, regions)
+        field = self.frames[-1].field
+        still = Gaussians.of(field if regions is None else clear_lost_rows(field, regions))
         renderer = renderer_of(self.frames[-1], self.config)._replace(regions=regions)
         error = renderer.squared_error(still, self.image)
         changed_pixels = _local_mean(error) > _MAX_GROWTH * _local_mean(self.error) + _LEVEL

@@ -8,18 +8,7 @@ import torch
 
 from kcgs.functional import RegionMap
 from kcgs.nn import GaussianField
-from kcgs.optim import Gaussians
 from kcgs.scene import Scene
-
-
-def clear_lost_rows(gaussians: Gaussians, regions: RegionMap) -> Gaussians:
-    """Make the rows of regions that a map lacks unused: they get the colour 0 and a region of the map."""
-    means, cholesky, colors, region_ids = gaussians
-    if region_ids is None:
-        return gaussians
-    is_present = torch.isin(region_ids, regions.ids)
-    region_ids = torch.where(is_present, region_ids, regions.ids[0])
-    return Gaussians(means, cholesky, torch.where(is_present[..., None], colors, 0.0), region_ids)
 
 
 def stack(frames: Sequence[Scene], metadata: Mapping[str, str]) -> Scene:
