@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from .evaluation import evaluate
     from .files import load, save
     from .fitting import FitConfig, FitResult, fit
-    from .functional import RegionMap
+    from .maps import RegionMap
     from .nn import GaussianField, RegionSplatRenderer
     from .pruning import prune
     from .scene import Scene
@@ -28,7 +28,7 @@ _MODULES = {
     "evaluation": ("evaluate",),
     "files": ("load", "save"),
     "fitting": ("FitConfig", "FitResult", "fit"),
-    "functional": ("RegionMap",),
+    "maps": ("RegionMap",),
     "nn": ("GaussianField", "RegionSplatRenderer"),
     "pruning": ("prune",),
     "scene": ("Scene",),

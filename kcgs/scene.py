@@ -17,8 +17,7 @@ from kcgs._check import check_size
 from kcgs._memory import check_memory
 from kcgs._repr import png, shorten
 from kcgs.errors import InvalidArgument
-from kcgs.functional import RegionMap
-from kcgs.maps import as_region_map
+from kcgs.maps import RegionMap, as_region_map
 from kcgs.nn import GaussianField, RegionSplatRenderer, rendered_size
 
 if TYPE_CHECKING:

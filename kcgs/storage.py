@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_count
-from kcgs.functional import RegionMap
-from kcgs.maps import softness_from_plain, softness_to_plain
+from kcgs.maps import RegionMap, softness_from_plain, softness_to_plain
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 

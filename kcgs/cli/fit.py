@@ -178,7 +178,7 @@ def read_regions(
     if not resize:
         expected = f"one map of the image's size, {size[1]} x {size[0]}, which --resize-regions makes of it"
         raise InvalidArgument("regions", expected, f"{labels.shape[-1]} x {labels.shape[-2]}")
-    from kcgs.functional import RegionMap
+    from kcgs.maps import RegionMap
 
     return RegionMap(labels).resize(size).labels
 

@@ -8,8 +8,7 @@ import numpy as np
 import torch
 
 from kcgs._check import check_count
-from kcgs.functional import PairSoftness, RegionMap
-from kcgs.maps import MAX_SOFTNESS, compact, touching_pairs, wrap_labels
+from kcgs.maps import MAX_SOFTNESS, PairSoftness, RegionMap, compact, touching_pairs, wrap_labels
 
 from .adaptive import AdaptiveSymbol
 from .exact import Integers

@@ -14,7 +14,8 @@ import torch
 from kcgs._check import check_count, check_floating, check_number
 from kcgs._repr import brief
 from kcgs.errors import InvalidArgument
-from kcgs.functional import RegionMap, check_cholesky
+from kcgs.functional import check_cholesky
+from kcgs.maps import RegionMap
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene, check_scene
 

@@ -16,7 +16,8 @@ from torch.utils.data import Dataset
 
 from kcgs._repr import brief
 from kcgs.errors import InvalidArgument
-from kcgs.functional import RegionMap, to_tokens
+from kcgs.functional import to_tokens
+from kcgs.maps import RegionMap
 from kcgs.nn import GaussianField, pad_rows
 from kcgs.scene import Scene, check_batch
 from kcgs.storage import MappedScene, map_file

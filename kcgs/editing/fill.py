@@ -9,7 +9,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from kcgs.compiled import threads_for_kernels
-from kcgs.functional import RegionMap, region_splat
+from kcgs.functional import region_splat
+from kcgs.maps import RegionMap
 from kcgs.nn import GaussianField, join
 from kcgs.optim import (
     End,

@@ -8,8 +8,7 @@ from collections.abc import Iterable, Sequence
 import torch
 
 from kcgs._check import check_count
-from kcgs.functional import RegionMap
-from kcgs.maps import PairSoftness, nearest_labels, touching_pairs
+from kcgs.maps import PairSoftness, RegionMap, nearest_labels, touching_pairs
 from kcgs.nn import GaussianField, join, scaled_gaussians
 from kcgs.scene import Scene, check_scene
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from kcgs._check import check_count
 from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument
-from kcgs.functional import RegionMap
+from kcgs.maps import RegionMap
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene, check_scene, check_type
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from kcgs.functional import RegionMap
+from kcgs.maps import RegionMap
 
 
 def map_of_each(regions: RegionMap, count: int) -> list[RegionMap]:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcgs.functional import RegionMap
+from kcgs.maps import RegionMap
 from kcgs.nn import GaussianField, pad_rows
 from kcgs.scene import Scene
 

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from kcgs._atomic import check_writable, write_file
-from kcgs.functional import RegionMap
+from kcgs.maps import RegionMap
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 

@@ -10,8 +10,7 @@ from torch import Tensor
 from kcgs._check import check_count
 from kcgs._image import as_image
 from kcgs.errors import InvalidArgument
-from kcgs.functional import RegionMap
-from kcgs.maps import as_region_map
+from kcgs.maps import RegionMap, as_region_map
 
 # pixels per Gaussian, where the user gives no number
 _PIXELS_PER_GAUSSIAN = 100

@@ -9,7 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs.functional import RegionMap, blur, gaussian_taps, region_splat
+from kcgs.functional import blur, gaussian_taps, region_splat
+from kcgs.maps import RegionMap
 from kcgs.scene import Scene
 
 from .contour_loops import (

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kcgs.functional import RegionMap, edge_band
+from kcgs.maps import RegionMap, edge_band
 from kcgs.optim import Gaussians, Renderer
 from kcgs.scene import Scene
 

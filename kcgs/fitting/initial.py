@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_count
-from kcgs.functional import RegionMap
+from kcgs.maps import RegionMap
 from kcgs.nn import GaussianField
 
 from .batch_maps import map_of_each

@@ -13,7 +13,7 @@ from kcgs._check import check_count, check_size
 from kcgs._memory import check_batch_memory
 from kcgs._objectives import Purpose
 from kcgs.errors import InvalidArgument
-from kcgs.functional import RegionMap, edge_band
+from kcgs.maps import RegionMap, edge_band
 from kcgs.optim import OBJECTIVES, ImageObjective, LossObjective, Objective
 
 from .batch_maps import regions_per_map

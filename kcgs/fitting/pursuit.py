@@ -12,9 +12,9 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
 from kcgs._check import check_count, check_floating
-from kcgs.functional import RegionMap, halve, lookup_regions, region_splat
+from kcgs.functional import halve, region_splat
 from kcgs.kernels import check_backend, takes_triton
-from kcgs.maps import pixels_under
+from kcgs.maps import RegionMap, lookup_regions, pixels_under
 from kcgs.nn import GaussianField
 from kcgs.optim import Objective, Renderer
 

@@ -7,7 +7,7 @@ from typing import Literal
 
 import torch
 
-from kcgs.functional import RegionMap
+from kcgs.maps import RegionMap
 from kcgs.scene import Scene, empty_regions
 
 

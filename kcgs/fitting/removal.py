@@ -9,8 +9,8 @@ from torch import Tensor
 
 from kcgs._check import check_count
 from kcgs.errors import InvalidArgument, InvalidArgumentType
-from kcgs.functional import RegionMap
 from kcgs.kernels import check_backend
+from kcgs.maps import RegionMap
 from kcgs.nn import GaussianField
 from kcgs.optim import Gaussians, Renderer, draft_cutoff
 

@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kcgs.functional import RegionMap, choose_softness
-from kcgs.maps import pairs_to_merge
+from kcgs.functional import choose_softness
+from kcgs.maps import RegionMap, pairs_to_merge
 from kcgs.nn import GaussianField, pad_rows
 from kcgs.optim import Renderer, draft_cutoff
 

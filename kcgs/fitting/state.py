@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import torch
 
 from kcgs._warn import warn_user
-from kcgs.functional import RegionMap
 from kcgs.kernels import MEAN_LIMIT
+from kcgs.maps import RegionMap
 from kcgs.optim import FieldState, is_within
 from kcgs.scene import Scene
 

@@ -21,7 +21,8 @@ from kcgs._check import (
 from kcgs._labels import check_labels
 from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument, InvalidArgumentType
-from kcgs.functional import RegionMap, check_cholesky, from_tokens, lookup_regions, to_tokens
+from kcgs.functional import check_cholesky, from_tokens, to_tokens
+from kcgs.maps import RegionMap, lookup_regions
 
 _HALF = (torch.float16, torch.bfloat16)
 _TABLES = ("means", "cholesky", "colors", "region_ids", "opacities")

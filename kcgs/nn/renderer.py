@@ -9,9 +9,9 @@ from torch import Tensor, nn
 
 from kcgs._check import check_cutoff, check_size
 from kcgs._sizes import is_equal
-from kcgs.functional import RegionMap, splat_at
+from kcgs.functional import splat_at
 from kcgs.kernels import check_backend
-from kcgs.maps import table_and_size
+from kcgs.maps import RegionMap, table_and_size
 
 from .field import GaussianField
 from .rows import scaled_gaussians

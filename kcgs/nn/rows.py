@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from kcgs._sizes import is_equal
-from kcgs.functional import RegionMap
+from kcgs.maps import RegionMap
 
 from .field import GaussianField
 

@@ -10,9 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs.functional import RegionMap
 from kcgs.kernels import Blocks, Coarsened, make_blocks
-from kcgs.maps import TILE
+from kcgs.maps import TILE, RegionMap
 from kcgs.nn import GaussianField
 
 from .groups import Group, Integers, group_tiles

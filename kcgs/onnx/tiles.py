@@ -7,10 +7,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcgs.functional import RegionMap
 from kcgs.maps import (
     TILE,
     Membership,
+    RegionMap,
     SmoothMembership,
     cut_windows,
     find_windows,

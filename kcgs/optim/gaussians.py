@@ -8,7 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kcgs.functional import RegionMap, region_splat, squared_error_gradients
+from kcgs.functional import region_splat, squared_error_gradients
+from kcgs.maps import RegionMap
 from kcgs.nn import GaussianField
 
 # cutoff of descents whose result is rendered with a smaller cutoff; it saves a third of the weights of 1e-4

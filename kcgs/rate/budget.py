@@ -19,8 +19,8 @@ from kcgs.codec import SceneWriter, decode, encode_region_map
 from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
 from kcgs.fitting import FitConfig, FitResult, HistoryEntry, Problem, fit_problem, make_problem, report_regions
-from kcgs.functional import RegionMap, edge_band, merge_regions
-from kcgs.maps import contour_edges, pairs_to_merge
+from kcgs.functional import merge_regions
+from kcgs.maps import RegionMap, contour_edges, edge_band, pairs_to_merge
 from kcgs.nn import GaussianField, area_mean, scaled_gaussians
 from kcgs.scene import Scene
 

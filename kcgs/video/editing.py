@@ -10,7 +10,7 @@ from torch import Tensor
 from kcgs.compiled import threads_for_kernels
 from kcgs.editing import check_offset, shift_labels, unique_region_ids, warn_of_lost_regions
 from kcgs.fitting import FitConfig, config_for
-from kcgs.functional import RegionMap
+from kcgs.maps import RegionMap
 from kcgs.nn import GaussianField, clear_lost_rows, join
 from kcgs.optim import Gaussians
 from kcgs.scene import Scene, check_batch

@@ -17,7 +17,7 @@ from kcgs._progress import Progress
 from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
 from kcgs.fitting import FitConfig, check_image_and_regions, check_num_gaussians, config_for, fit
-from kcgs.functional import RegionMap, lookup_regions
+from kcgs.maps import RegionMap, lookup_regions
 from kcgs.nn import clear_lost_rows, pad_rows
 from kcgs.optim import Gaussians
 from kcgs.scene import Scene

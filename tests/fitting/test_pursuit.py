@@ -11,10 +11,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcgs import fit
+from kcgs import RegionMap, fit
 from kcgs.fitting import propose_gaussians
 from kcgs.fitting.pursuit import _average, _evaluate, _scales, propose
-from kcgs.functional import RegionMap, lookup_regions, region_splat
+from kcgs.functional import lookup_regions, region_splat
 from kcgs.nn import GaussianField
 
 

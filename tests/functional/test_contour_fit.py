@@ -8,8 +8,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from kcgs import RegionMap
 from kcgs.data import chart_2x3, chart_pie, load_image, load_labels
-from kcgs.functional import RegionMap, choose_softness, contour_fit
+from kcgs.functional import choose_softness, contour_fit
 from kcgs.functional.contour_fit import contour_gain
 
 COLORS = torch.tensor([[0.2, 0.3, 0.6], [0.8, 0.6, 0.3]])

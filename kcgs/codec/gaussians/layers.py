@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from kcgs.codec.adaptive import AdaptiveAngle, AdaptiveMagnitude, AdaptiveNumber, AdaptiveSymbol
 from kcgs.codec.exact import Floats, Integers, exp2
 from kcgs.codec.rangecoder import CodecError, Coder, Reader, Writer
-from kcgs.functional import RegionMap
-from kcgs.maps import pixels_under
+from kcgs.maps import RegionMap, pixels_under
 
 from .occupancy import COUNT_BITS, OccupancyCoder
 from .quantize import ENERGIES, MAX_RATIO, OCTAVES, SIZES, Classes, Codes, Parameters, Quantizer

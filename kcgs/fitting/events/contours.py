@@ -13,7 +13,7 @@ from kcgs.fitting.batch_maps import join_maps, map_of, map_of_each
 from kcgs.fitting.contour_moves import move_contours
 from kcgs.fitting.start import with_chosen_softness
 from kcgs.fitting.state import FitState
-from kcgs.functional import RegionMap
+from kcgs.maps import RegionMap
 from kcgs.optim import Gaussians
 
 # largest share of the time of a fit so far that moves of the contours may take

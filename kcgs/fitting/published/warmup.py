@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from kcgs.fitting.state import FitState
-from kcgs.functional import lookup_regions
+from kcgs.maps import lookup_regions
 
 
 @dataclass(frozen=True)
