@@ -1,14 +1,16 @@
 """Results that are derived from a map's table on first use: the map at other sizes, and a kernel's arrays.
 
-A result lives as long as the tensor `starts` of its table, so it must not refer to that tensor. Results of labels
-alone, whose table has no `starts`, are not kept.
+A RegionMap cannot hold them: operators of torch take no objects, so that a table reaches the kernels as tensors, also
+from compiled graphs. They are kept by `starts`, a tensor that no other table has, and live as long as it does; so they
+must not refer to it. As an attribute of this tensor they would be pickled with it, for instance in an exported program.
+Results of labels alone, whose table has no `starts`, are not kept.
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from torch.utils.weak import WeakTensorKeyDictionary
 
@@ -29,13 +31,10 @@ def derive(table: MapTable, make: Callable[[MapTable], T]) -> T:
     """Return make(table); the function is called once per table that has `starts`."""
     if table.starts is None:
         return make(table)
-    results: dict[Any, Any] | None = _derived.get(table.starts)
-    if results is None:
-        _derived[table.starts] = results = {}
+    results: dict[Callable[[MapTable], T], T] = _derived.setdefault(table.starts, {})
     if make not in results:
         results[make] = make(table)
-    result: T = results[make]
-    return result
+    return results[make]
 
 
 def _resampler(table: MapTable) -> Callable[[tuple[int, int]], Resampled]:
