@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kcgs._torch_internals import with_autograd
 from kcgs.kernels import Kernel, SplatInputs, resolve
-from kcgs.maps import RegionMap, positions_of, table_and_size, with_positions
+from kcgs.maps import MapTable, RegionMap, positions_of, table_and_size, with_positions
 
 from .arguments import SplatArguments
 from .values import check_region_ids, check_values
@@ -132,11 +132,10 @@ def _image_with_graph(arguments: SplatArguments) -> tuple[Tensor, list[Tensor]]:
 
 def _make_inputs(arguments: SplatArguments, check: bool) -> tuple[SplatInputs, Kernel]:
     """Return the inputs of the kernel, and the kernel."""
-    ids = regions = table = None
+    table = region_ids = None
     if arguments.table is not None and arguments.region_ids is not None:
-        table, regions = with_positions(arguments.table), arguments.region_ids.contiguous()
-        ids = table.ids
-    inputs = SplatInputs(*arguments[:3], regions, table, arguments.size, arguments.cutoff, ids)
+        table, region_ids = with_positions(arguments.table), arguments.region_ids.contiguous()
+    inputs = SplatInputs(*arguments[:3], None, table, arguments.size, arguments.cutoff, region_ids)
     kernel = resolve(arguments.backend, inputs)
     if not kernel.looks_up_regions:
         inputs = _look_up(inputs, check)
@@ -147,26 +146,25 @@ def _make_inputs(arguments: SplatArguments, check: bool) -> tuple[SplatInputs, K
 
 def _look_up(inputs: SplatInputs, check: bool) -> SplatInputs:
     """Replace the ids of regions by their positions."""
-    if inputs.ids is None or inputs.region_index is None:
+    if inputs.table is None or inputs.region_ids is None:
         return inputs
-    index = _positions(inputs)
-    known = index.device.type == "cpu" and int(index.numpy().min(initial=0)) >= 0
+    positions = _positions(inputs.region_ids, inputs.table)
+    known = positions.device.type == "cpu" and int(positions.numpy().min(initial=0)) >= 0
     if check and not known:
-        check_region_ids(inputs.region_index, index)
+        check_region_ids(inputs.region_ids, positions)
     # one region covers everything, and holds all Gaussians: no map is needed
-    if len(inputs.ids) == 1 and known:
-        return inputs._replace(region_index=None, table=None, ids=None)
-    return inputs._replace(region_index=index, ids=None)
+    if inputs.table.num_regions == 1 and known:
+        return inputs._replace(table=None, region_ids=None)
+    return inputs._replace(region_positions=positions, region_ids=None)
 
 
 def _check_ids(inputs: SplatInputs) -> None:
     """Refuse negative region ids, and warn of ids that the map does not hold."""
-    if inputs.ids is not None and inputs.region_index is not None:
-        check_region_ids(inputs.region_index, _positions(inputs))
+    if inputs.table is not None and inputs.region_ids is not None:
+        check_region_ids(inputs.region_ids, _positions(inputs.region_ids, inputs.table))
 
 
-def _positions(inputs: SplatInputs) -> Tensor:
+def _positions(region_ids: Tensor, table: MapTable) -> Tensor:
     """Return the position of each Gaussian's region among the ids of the map, (B, N)."""
-    assert inputs.ids is not None and inputs.region_index is not None
-    region_ids = inputs.region_index
-    return positions_of(region_ids if region_ids.ndim == 2 else region_ids[None], inputs.ids)
+    assert table.ids is not None
+    return positions_of(region_ids if region_ids.ndim == 2 else region_ids[None], table.ids)

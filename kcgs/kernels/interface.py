@@ -21,11 +21,11 @@ class SplatInputs(NamedTuple):
     means: Tensor  # [B, N, 2] pixels
     cholesky: Tensor  # [B, N, 3] pixels
     colors: Tensor  # [B, N, C]
-    region_index: Tensor | None  # [B, N] int64, position in the sorted list of regions; -1: not in the map
-    table: MapTable | None  # of the map at its own size, with positions; None: one region covers everything
+    region_positions: Tensor | None  # [B, N] int64, among the ids of the table; -1: not in the map
+    table: MapTable | None  # of the map at its own size, with ids; None: one region covers everything
     size: tuple[int, int]  # (height, width)
     cutoff: float
-    ids: Tensor | None = None  # [R] int64, sorted; with them, `region_index` holds ids that the kernel looks up
+    region_ids: Tensor | None = None  # [B, N] int64, in place of positions for a kernel that looks them up
 
     @property
     def gaussians(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -57,8 +57,8 @@ class Kernel(NamedTuple):
     checks_values: `plan` returns None if, and only if, a value is not finite or beyond the limits in whitened.py.
         False: the caller has checked the values.
     takes_one_image: Gaussians of one image may come without B; the results then have no B either. False: B is there.
-    looks_up_regions: `region_index` holds region ids, which the kernel looks up in `ids`. `plan` returns None for
-        negative ids, too; its `foreign` is the number of Gaussians whose id the map does not hold.
+    looks_up_regions: the kernel takes `region_ids`, and looks up their positions. `plan` returns None for negative
+        ids, too; its `foreign` is the number of Gaussians whose id the map does not hold.
     """
 
     plan: Callable[[SplatInputs], Any]

@@ -61,7 +61,7 @@ def splat(inputs: SplatInputs) -> Tensor:
 
 def _regions(inputs: SplatInputs, b: int) -> Iterator[tuple[Tensor, Tensor | None]]:
     """Yield the Gaussians of each region of an image, and the membership of its pixels, (H * W,); None: all 1."""
-    table, index = inputs.table, inputs.region_index
+    table, index = inputs.table, inputs.region_positions
     if table is None or index is None:
         yield torch.arange(inputs.means.shape[1], device=inputs.means.device), None
         return

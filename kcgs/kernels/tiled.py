@@ -110,7 +110,8 @@ def _list_pairs(inputs: SplatInputs, grid: TileGrid, keys: Tensor, num_regions: 
     image, tile = gaussian // inputs.means.shape[1], place[:, 1] * grid.cols + place[:, 0]
     if inputs.table is not None and inputs.table.shape[0] > 1:
         tile = image * grid.rows * grid.cols + tile
-    region = torch.zeros_like(gaussian) if inputs.region_index is None else inputs.region_index.flatten()[gaussian]
+    positions = inputs.region_positions
+    region = torch.zeros_like(gaussian) if positions is None else positions.flatten()[gaussian]
     row, is_present = find_keys(keys, tile, region, num_regions)
     pairs = (is_present & reaches(origin, cholesky[gaussian], radius)).nonzero().flatten()
     gaussian, block = gaussian[pairs], (image * len(keys) + row)[pairs]

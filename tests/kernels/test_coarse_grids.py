@@ -59,13 +59,13 @@ def render_formulas(inputs: SplatInputs) -> list[Tensor]:
     images = []
     for b in range(len(leaves[0])):
         gaussians = [t[b] for t in leaves]
-        if inputs.table is None or inputs.region_index is None:
+        if inputs.table is None or inputs.region_positions is None:
             images.append(_render_region(*gaussians, inputs))
             continue
         total = torch.zeros(3, *inputs.size, dtype=torch.float64)
         membership = membership_at(inputs.table, inputs.size)
         for region in range(inputs.table.num_regions):
-            members = inputs.region_index[b] == region
+            members = inputs.region_positions[b] == region
             weights = membership.weights(b % inputs.table.shape[0], region, torch.float64)
             total = total + weights * _render_region(*(t[members] for t in gaussians), inputs)
         images.append(total)
@@ -144,6 +144,6 @@ def test_one_gaussian_of_each_level() -> None:
     inputs = make_inputs((150, 110), n=4, maps=1, softness=0.7)
     sigma = 2.0 ** torch.arange(4) / (max_spacing(CUTOFF) / 2**0.25) * 1.01
     cholesky = sigma[:, None] * torch.tensor([[[1.0, 0.0, 1.0]]])
-    inputs = inputs._replace(cholesky=cholesky, region_index=torch.tensor([[0, 1, 2, 1]]))
+    inputs = inputs._replace(cholesky=cholesky, region_positions=torch.tensor([[0, 1, 2, 1]]))
     assert choose_levels(cholesky[0].double(), max_spacing(CUTOFF), 4).tolist() == [0, 1, 2, 3]
     assert_close(render(cpu, inputs), render_formulas(inputs), 2e-6)

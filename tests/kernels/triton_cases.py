@@ -62,11 +62,12 @@ def make_inputs(
 
 
 def with_ids(inputs: SplatInputs) -> SplatInputs:
-    """Return the same with ids, 5, 8, 11 ..., and 7 where there is no region."""
-    if inputs.region_index is None or inputs.table is None:
+    """Return the same with ids, 5, 8, 11 ..., and 7 where there is no region, in place of positions."""
+    if inputs.region_positions is None or inputs.table is None:
         return inputs
-    ids = torch.where(inputs.region_index >= 0, 3 * inputs.region_index + 5, 7)
-    return inputs._replace(region_index=ids, ids=3 * torch.arange(inputs.table.num_regions, device=DEVICE) + 5)
+    region_ids = torch.where(inputs.region_positions >= 0, 3 * inputs.region_positions + 5, 7)
+    table = inputs.table._replace(ids=3 * torch.arange(inputs.table.num_regions, device=DEVICE) + 5)
+    return inputs._replace(region_positions=None, table=table, region_ids=region_ids)
 
 
 def probe(inputs: SplatInputs) -> Tensor:

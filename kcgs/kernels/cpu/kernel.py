@@ -56,9 +56,9 @@ def kernel_for(inputs: SplatInputs) -> Kernel:
 def plan(inputs: SplatInputs) -> CpuPlan | None:
     """List which Gaussians touch which blocks; None where a value is out of range."""
     means, cholesky, colors = (_array(t) for t in inputs.gaussians)
-    if inputs.table is not None and inputs.region_index is not None:
+    if inputs.table is not None and inputs.region_positions is not None:
         table = derive(table_at(inputs.table, inputs.size), _table_of)
-        regions = inputs.region_index.flatten().numpy()
+        regions = inputs.region_positions.flatten().numpy()
     else:
         table, regions = _table_without_map(inputs.size), np.empty(0, np.int64)
     batch = Batch(inputs.colors.shape[:-2].numel(), means, cholesky, colors, regions)

@@ -88,14 +88,14 @@ def plan(inputs: SplatInputs) -> CudaPlan | None:
     waits = room is None
     counters = torch.zeros(_COUNTERS, dtype=torch.int64, device=device)
     gaussians = torch.empty(4, total, dtype=torch.int32, device=device)
-    ids, num_ids, map_tiles, starts, regions, planes, weights = inputs.ids, 0, 1, None, None, None, None
-    if ids is not None and inputs.table is not None:
+    ids, num_ids, map_tiles, starts, regions, planes, weights = None, 0, 1, None, None, None, None
+    if inputs.table is not None:
         starts, regions, planes, weights = table_at(inputs.table, inputs.size).tiles
-        num_ids, map_tiles = len(ids), len(starts) - 1
+        ids, num_ids, map_tiles = inputs.table.ids, inputs.table.num_regions, len(starts) - 1
     with torch.cuda.device_of(means):
         _prepare(
             (-(-total // _PREPARE_BLOCK),),
-            means, cholesky, colors, inputs.region_index, ids, counters, gaussians, notes, total, num_ids,
+            means, cholesky, colors, inputs.region_ids, ids, counters, gaussians, notes, total, num_ids,
             num_ids.bit_length(), height, width, channels, radius, MAPPED=num_ids > 0,
             NOTES=waits and reports(), BLOCK=_PREPARE_BLOCK,
         )  # fmt: skip
