@@ -51,7 +51,7 @@ def evaluate(scene: Scene, image: Any, labels: Any = None, *, with_ssimulacra2: 
     target = target.to(render.device)
     metrics = {}
     for name, metric in METRICS.items():
-        if name == "ssimulacra2" and not with_ssimulacra2:
+        if metric.is_optional and not with_ssimulacra2:
             continue
         if not metric.takes_labels:
             try:

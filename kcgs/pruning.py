@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcgs._check import check_number
 from kcgs._repr import brief
-from kcgs.nn import GaussianField, RegionSplatRenderer
+from kcgs.nn import GaussianField, RegionSplatRenderer, used_rows
 from kcgs.scene import Scene, check_scene
 
 
@@ -19,7 +19,7 @@ class PruneResult(NamedTuple):
 
     scene: Scene
     num_pruned: int | Tensor
-    """Number of removed Gaussians; (B,) for a batch: Gaussians whose colour became 0."""
+    """Number of removed Gaussians; (B,) for a batch: rows that became unused."""
     prune_error: float | Tensor
     """Largest change of a value of the image; (B,) for a batch."""
 
@@ -29,7 +29,7 @@ def prune(scene: Scene, tolerance: float = 1e-3, *, cutoff: float = 1e-4, backen
 
     Gaussians with the smallest effect on the image are removed first. The tolerance bounds the sum of their effects:
     a render of all removed Gaussians with the absolute values of their colours nowhere exceeds it. In a batch all
-    images have the same number of rows, so removed Gaussians keep their row and get the colour 0.
+    images have the same number of rows, so the rows of removed Gaussians stay, unused (colour 0).
 
     Args:
         scene: of one image, or a batch.
@@ -79,7 +79,7 @@ def prune(scene: Scene, tolerance: float = 1e-3, *, cutoff: float = 1e-4, backen
 def _prune_batch(scene: Scene, tolerance: float, render: RegionSplatRenderer) -> PruneResult:
     """Prune all images of a batch at once: see `prune`."""
     colors, regions, ids = scene.field.merged_colors().detach(), scene.regions, scene.field.region_ids
-    had_color = (colors != 0).any(-1)
+    was_used = used_rows(colors)
     if regions is not None and ids is not None:
         colors = torch.where((regions.index_of(ids) >= 0)[..., None], colors, 0.0)
     if colors.numel() == 0:
@@ -96,7 +96,7 @@ def _prune_batch(scene: Scene, tolerance: float, render: RegionSplatRenderer) ->
             low, high = torch.where(within, middle, low), torch.where(within, high, middle - 1)
         pruned = _recolor(scene, torch.where((rank < low[:, None])[..., None], 0.0, colors))
         change = (render(scene) - render(pruned)).abs().amax((1, 2, 3))
-    return PruneResult(pruned, (had_color & (pruned.field.colors == 0).all(-1)).sum(1), change)
+    return PruneResult(pruned, (was_used & ~used_rows(pruned.field.colors)).sum(1), change)
 
 
 def _subset(scene: Scene, mask: Tensor) -> Scene:

@@ -18,7 +18,7 @@ from kcgs._memory import check_memory
 from kcgs._repr import png, shorten
 from kcgs.errors import InvalidArgument
 from kcgs.maps import RegionMap, as_region_map
-from kcgs.nn import GaussianField, RegionSplatRenderer, rendered_size
+from kcgs.nn import GaussianField, RegionSplatRenderer, rendered_size, used_rows
 
 if TYPE_CHECKING:
     import onnx
@@ -210,7 +210,7 @@ def empty_regions(scene: Scene) -> Tensor:
     regions, ids = scene.regions, scene.field.region_ids
     if regions is None or ids is None or ids.is_meta:
         return torch.empty(0, dtype=torch.int64)
-    return regions.ids[~torch.isin(regions.ids, ids[(scene.field.merged_colors() != 0).any(-1)])]
+    return regions.ids[~torch.isin(regions.ids, ids[used_rows(scene.field.merged_colors())])]
 
 
 def check_type(scene: object, name: str = "scene") -> Scene:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from kcgs._check import check_count
 from kcgs.maps import RegionMap, softness_from_plain, softness_to_plain
-from kcgs.nn import GaussianField
+from kcgs.nn import GaussianField, used_rows
 from kcgs.scene import Scene
 
 FORMAT = "kcgs.scene"
@@ -98,8 +98,8 @@ class MappedScene:
         return RegionMap(labels, softness_from_plain(self._header["softness"]))
 
     def scene(self, index: int) -> Scene:
-        """Return one of the scenes, without rows of the colour 0."""
-        rows = (self.tensors["colors"][index] != 0).any(-1)
+        """Return one of the scenes, without unused rows."""
+        rows = used_rows(self.tensors["colors"][index])
         means, cholesky, colors = (self.tensors[name][index][rows] for name in _REQUIRED)
         ids = self.tensors["region_ids"][index][rows].long() if "region_ids" in self.tensors else None
         field = GaussianField(means, cholesky, colors, ids, size=self.size)

@@ -28,7 +28,7 @@ _DIGITS = 5
 
 @brief
 class SceneBatch(NamedTuple):
-    """Scenes of a data set as tensors; rows that an image does not need have the colour 0.
+    """Scenes of a data set as tensors; unused rows have the colour 0.
 
     In shards of `kcgs fit-many` rows are in the order of :func:`kcgs.fitting.rank_gaussians`. Label maps are those of
     ``dataset[k].regions``.
@@ -59,7 +59,7 @@ class SceneBatch(NamedTuple):
 class SceneDataset(Dataset[Scene]):
     r"""The scenes in the shards of a folder, as `kcgs fit-many --shard` writes them: a torch Dataset.
 
-    Convention: an index gives a scene, without rows of the colour 0. Batches come as tensors, by torch's
+    Convention: an index gives a scene, without unused rows. Batches come as tensors, by torch's
     ``__getitems__``: pass :meth:`collate` to a DataLoader. Files are mapped into memory, so that only the requested
     rows are read. A copy in another process, spawned or forked, opens the files itself.
 
@@ -121,7 +121,7 @@ class SceneDataset(Dataset[Scene]):
         return len(self.names)
 
     def __getitem__(self, index: int) -> Scene:
-        """Return a scene, without rows of the colour 0."""
+        """Return a scene, without unused rows."""
         position = range(len(self))[operator.index(index)]
         number = int(torch.searchsorted(self._firsts, position, right=True)) - 1
         return self._shard(number).scene(position - int(self._firsts[number]))

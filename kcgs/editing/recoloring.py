@@ -17,7 +17,7 @@ from kcgs.errors import InvalidArgument
 from kcgs.nn import GaussianField, join
 from kcgs.scene import Scene, check_type
 
-from .selection import check_own_size, members_of, unique_region_ids
+from .selection import members_of, unique_region_ids
 
 Numbers = Tensor | NDArray[Any] | Sequence[Any] | float
 
@@ -111,7 +111,6 @@ def _paint(scene: Scene, region_id: int, color: str | Numbers, strength: float) 
     """Give a region a share of a colour times a linear function of the luma; see `recolor_region`."""
     if scene.regions is None:
         raise InvalidArgument("scene", "a label map", "none", verb="have")
-    check_own_size(scene.regions)
     pixels = scene.regions.labels == region_id
     if not pixels.any():
         raise InvalidArgument("region_ids", "of regions with pixels in the map", region_id)

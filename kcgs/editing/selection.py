@@ -43,14 +43,9 @@ def select_regions(scene: Scene, region_ids: object) -> Selection:
 def select_regions_to_relabel(scene: Scene, region_ids: object) -> Selection:
     """Select regions of a map whose labels are those of its contours: a resized map has finer contours."""
     selection = select_regions(scene, region_ids)
-    check_own_size(selection.regions)
-    return selection
-
-
-def check_own_size(regions: RegionMap) -> None:
-    """Refuse a resized map."""
-    if regions.is_resampled:
+    if selection.regions.is_resampled:
         raise ValueError("scene must not have a resized map: edit the map at its own size, then resize it")
+    return selection
 
 
 def select_removable_regions(scene: Scene, region_ids: object) -> Selection:

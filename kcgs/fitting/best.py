@@ -18,7 +18,7 @@ class Best(NamedTuple):
     """The best measured scene of each image, and the numbers that rank it."""
 
     field: GaussianField
-    """A batch of copies; rows that a scene lacks have the colour 0."""
+    """A batch of copies; rows that a scene lacks are unused."""
     maps: list[RegionMap | None]
     """For each image the map of its render, which may be a batch of maps with this map at the image's index."""
     is_draft: Tensor

@@ -78,7 +78,7 @@ def region_costs(scene: Scene, image: Tensor, boxes: Ints, pad: int, sigma: floa
 
 
 def _pad_rows(gaussians: tuple[Tensor, ...], first: Tensor, end: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Make a batch of the rows from first to end, (B,), padded to the longest range with rows of the colour 0."""
+    """Make a batch of the rows from first to end, (B,), padded to the longest range with unused rows."""
     means, cholesky, colors = gaussians
     rows = first[:, None] + torch.arange(max(1, int((end - first).max())), device=first.device)
     is_member, rows = (rows < end[:, None])[:, :, None], rows.clamp_max(len(means) - 1)

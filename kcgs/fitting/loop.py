@@ -64,11 +64,11 @@ def fit(
     `on_step` counts the iterations of each fit. The scene may have fewer than N Gaussians: pruning removes some, and a
     search ends with fewer.
 
-    All images of a batch have the same number of rows; rows that an image does not need have the colour 0. On a CPU
-    each image gets, bit for bit, the scene that it gets alone with the same seed. The exceptions: the clock stops the
-    fit, there are hardly more Gaussians than regions, or the image does not need all its Gaussians. An image whose
-    numbers overflow keeps its best scene, with a UserWarning; the other images go on. The history has means over the
-    images.
+    All images of a batch have the same number of rows; rows that an image does not need are unused, with the colour 0.
+    On a CPU each image gets, bit for bit, the scene that it gets alone with the same seed. The exceptions: the clock
+    stops the fit, there are hardly more Gaussians than regions, or the image does not need all its Gaussians. An image
+    whose numbers overflow keeps its best scene, with a UserWarning; the other images go on. The history has means over
+    the images.
 
     The history's `loss` is the value of the objective. With a loss of your own, such as a loss of Kornia, the result is
     the scene with the lowest loss. Gaussians are added where the render differs from the image, and contours move to

@@ -15,7 +15,7 @@ from kcgs._check import check_count, check_floating
 from kcgs.functional import halve, region_splat
 from kcgs.kernels import check_backend, takes_triton
 from kcgs.maps import RegionMap, lookup_regions, pixels_under
-from kcgs.nn import GaussianField
+from kcgs.nn import GaussianField, used_rows
 from kcgs.optim import Objective, Renderer
 
 from .checks import regions_of
@@ -62,7 +62,7 @@ def propose_gaussians(
         backend: as in :func:`kcgs.functional.region_splat`.
 
     Returns:
-        A field, without a graph; a batch of fields for :math:`(B, C, H, W)`, padded with rows of the colour 0 for
+        A field, without a graph; a batch of fields for :math:`(B, C, H, W)`, padded with unused rows for
         images with fewer Gaussians.
 
     Raises:
@@ -106,7 +106,7 @@ class _Proposals(NamedTuple):
         return proposals, torch.arange(len(proposals.image), device=counts.device) - firsts[proposals.image]
 
     def rows(self, batch: int) -> list[Tensor]:
-        """Return means, factors and colours, (B, K, ...), of each image, padded with rows of the colour 0."""
+        """Return means, factors and colours, (B, K, ...), of each image, padded with unused rows."""
         proposals, place = self.by_image(batch)
         most = int(place.max()) + 1 if len(place) else 0
         tables = [
@@ -176,7 +176,7 @@ def add_gaussians(state: FitState, count: int, fewer: Sequence[int] = ()) -> Non
     """Add the Gaussians, at most `count`, that lower the objective of each image of a fit most.
 
     In a batch, new Gaussians also replace an image's frozen rows. Where an image can use fewer Gaussians than others,
-    the rest of its rows have the colour 0 and are frozen.
+    the rest of its rows are unused and frozen.
 
     Args:
         state: of the fit.
@@ -194,7 +194,7 @@ def add_gaussians(state: FitState, count: int, fewer: Sequence[int] = ()) -> Non
     missing.index_fill_(0, torch.tensor(state.diverged, dtype=torch.int64, device=is_used.device), 0)
     added = propose_for(state.objective, state.render().detach(), state.renderer, missing)
     optimizer.append(field, added)
-    is_used = torch.cat([is_used, (added.colors.detach() != 0).any(-1)], 1)
+    is_used = torch.cat([is_used, used_rows(added.colors)], 1)
     num_used = is_used.sum(1, keepdim=True)
     # keep the same number of rows of each image: those in use, and the first frozen rows
     is_kept = is_used | ((~is_used).cumsum(1) <= num_used.max() - num_used)

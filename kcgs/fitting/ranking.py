@@ -20,8 +20,7 @@ def rank_gaussians(field: GaussianField, regions: RegionMap | Tensor | None = No
     r"""Order Gaussians by importance, so that for any K the first K approximate the render well.
 
     Convention: Gaussians are removed from the whole render in 16 rounds. Each round removes the Gaussians whose single
-    removal raises the squared error least. Gaussians that are removed later come earlier; rows of the colour 0 come
-    last.
+    removal raises the squared error least. Gaussians that are removed later come earlier; unused rows come last.
 
     Args:
         field: N Gaussians of an image, or of each image of a batch, without opacities.

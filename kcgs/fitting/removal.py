@@ -11,7 +11,7 @@ from kcgs._check import check_count
 from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.kernels import check_backend
 from kcgs.maps import RegionMap
-from kcgs.nn import GaussianField
+from kcgs.nn import GaussianField, used_rows
 from kcgs.optim import Gaussians, Renderer, draft_cutoff
 
 from .checks import regions_of
@@ -82,7 +82,7 @@ def lowest_weighted_impact(
 
     area = math.pi * cholesky[..., :1] * cholesky[..., 2:]
     energy = weight * colors.square().sum(-1) * area[..., 0]
-    num_unused = (colors == 0).all(-1).sum(-1, keepdim=True)
+    num_unused = (~used_rows(colors)).sum(-1, keepdim=True)
     is_strong = ~_lowest(energy, num_unused + (energy.shape[-1] - num_unused) // 2)
     norm, factors = (0.5 * area).rsqrt(), is_strong[..., None].to(colors)
     overlaps = norm * products(cholesky / math.sqrt(2.0), norm * factors)

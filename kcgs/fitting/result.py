@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from kcgs.nn import used_rows
 from kcgs.plots import history_figure
 from kcgs.scene import Scene
 
@@ -41,7 +42,7 @@ class FitResult(NamedTuple):
 
     scene: Scene
     """Without regions if nothing is confined. For a batch of images a batch, with the same number of rows for each
-    image: rows that an image does not need have the colour 0."""
+    image: rows that an image does not need are unused, with the colour 0."""
     history: list[HistoryEntry]
     """Its EF-PSNR is measured along the contours of the user's map, not of the scene's: see :class:`HistoryEntry`."""
     stop_reason: str
@@ -62,7 +63,7 @@ class FitResult(NamedTuple):
     """Images whose numbers overflowed; they keep their best scene from before."""
 
     def of_image(self, index: int) -> FitResult:
-        """Return the result of one image of a batch: its scene without rows of the colour 0, its PSNR and its report.
+        """Return the result of one image of a batch: its scene without unused rows, its PSNR and its report.
 
         The history is still that of the batch.
 
@@ -74,7 +75,7 @@ class FitResult(NamedTuple):
             (0, 8)
         """
         index, scene = range(len(self.scene))[index], self.scene[index]
-        field = scene.field.subset((scene.field.colors != 0).any(-1))
+        field = scene.field.subset(used_rows(scene.field.colors))
         numbers = (torch.as_tensor(values)[index].item() for values in (self.num_pruned, self.prune_error, self.psnr))
         num_pruned, prune_error, psnr = numbers
         return self._replace(

@@ -39,7 +39,7 @@ def start(problem: Problem) -> FitState:
 
 
 def _initial_field(problem: Problem, regions: RegionMap | None, counts: list[int]) -> GaussianField:
-    """Return `counts` Gaussians of the images, padded at the end with rows of the colour 0."""
+    """Return `counts` Gaussians of the images, padded at the end with unused rows."""
     initialize = problem.objects.initializer or _INITIALIZERS[problem.config.initializer]
     images, most = problem.target, max(counts)
 

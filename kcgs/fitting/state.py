@@ -57,7 +57,7 @@ class FitState(FieldState):
 
     @property
     def num_gaussians(self) -> int:
-        """Current rows of each image, including rows of the colour 0."""
+        """Current rows of each image, including unused rows."""
         return self.field.num_gaussians
 
     @property
@@ -89,7 +89,7 @@ class FitState(FieldState):
     def exclude(self, images: list[int]) -> None:
         """Mark overflowing images as diverged, with a warning.
 
-        If other images are left, the Gaussians of diverged images get the colour 0 and are frozen.
+        If other images are left, the rows of diverged images become unused and are frozen.
         """
         if new := [image for image in images if image not in self.diverged]:
             self.diverged += new

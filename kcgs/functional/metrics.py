@@ -204,6 +204,8 @@ class Metric(NamedTuple):
     """When the metric is NaN."""
     takes_labels: bool = False
     """Whether the metric is taken along contours."""
+    is_optional: bool = False
+    """Whether the metric is slow and needs another package: `evaluate` may leave it out."""
 
 
 # what `evaluate` and the command line report, in this order
@@ -213,7 +215,7 @@ METRICS = {
     "ms_ssim": Metric(ms_ssim, f"a side is below {_MS_SSIM_SIDE} pixels"),
     "ef_psnr": Metric(ef_psnr, "no contours", takes_labels=True),
     "ef_ssim": Metric(ef_ssim, f"no contours, or a side is below {SSIM_WINDOW} pixels", takes_labels=True),
-    "ssimulacra2": Metric(ssimulacra2, "it needs pip install ssimulacra2, and 8 pixels per side"),
+    "ssimulacra2": Metric(ssimulacra2, "it needs pip install ssimulacra2, and 8 pixels per side", is_optional=True),
 }
 
 

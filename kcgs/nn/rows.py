@@ -39,8 +39,17 @@ def join(first: GaussianField, second: GaussianField) -> GaussianField:
     return GaussianField(means, cholesky, concatenate(first.colors, second.colors), ids, opacities, size=first.size)
 
 
+def used_rows(colors: Tensor) -> Tensor:
+    """Return the mask of used rows, bool (..., N), by colours with opacities merged, (..., N, C).
+
+    All images of a batch have as many rows. A row that an image does not need is unused: its colour is 0, so it paints
+    nothing, and its other numbers mean nothing.
+    """
+    return (colors != 0).any(-1)
+
+
 def clear_lost_rows(field: GaussianField, regions: RegionMap) -> GaussianField:
-    """Make the rows of regions that a map lacks unused, without the graph: colour 0, and the map's first region."""
+    """Make the rows of regions that a map lacks unused, with the map's first region; without the graph."""
     if field.region_ids is None:
         return field
     is_present = torch.isin(field.region_ids, regions.ids)
@@ -50,10 +59,10 @@ def clear_lost_rows(field: GaussianField, regions: RegionMap) -> GaussianField:
 
 
 def pad_rows(field: GaussianField, count: int, regions: RegionMap | None = None) -> GaussianField:
-    """Pad a field with black Gaussians to `count` per image, without the graph; opacities are merged into the colours.
+    """Pad a field with unused rows to `count` per image, without the graph; opacities are merged into the colours.
 
-    The new Gaussians have the region of the image's first Gaussian or, with a map, the map's first region. With a map,
-    all Gaussians of a field without ids get the map's first region.
+    The new rows have the region of the image's first Gaussian or, with a map, the map's first region. With a map, all
+    Gaussians of a field without ids get the map's first region.
     """
     missing, ids = count - field.num_gaussians, field.region_ids
     means, cholesky, colors = (

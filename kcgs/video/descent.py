@@ -110,7 +110,7 @@ class FrameDescent(NewtonDescent):
     def _relocate(self, share: float) -> None:
         """Relocate a share of the movable rows, those of the lowest impact, to where they lower the error most.
 
-        Rows that lower the error nowhere get the colour 0.
+        Rows that lower the error nowhere become unused.
         """
         gaussians, renderer = self.gaussians, self.renderer
         count = round(share * int(self.movable_rows.sum()))

@@ -11,7 +11,7 @@ from kcgs.compiled import threads_for_kernels
 from kcgs.editing import check_offset, shift_labels, unique_region_ids, warn_of_lost_regions
 from kcgs.fitting import FitConfig, config_for
 from kcgs.maps import RegionMap
-from kcgs.nn import GaussianField, clear_lost_rows, join
+from kcgs.nn import GaussianField, clear_lost_rows, join, used_rows
 from kcgs.optim import Gaussians
 from kcgs.scene import Scene, check_batch
 
@@ -71,7 +71,7 @@ def delete_from_video(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
             field = GaussianField(means, cholesky, colors, ids, size=scenes.size)
             start = Scene(field, new_regions[t])
             movable_rows, changed_pixels = torch.ones_like(deleted_rows[t]), torch.ones_like(deleted_pixels[t])
-            unused = deleted_rows[t] & (colors == 0).all(-1)
+            unused = deleted_rows[t] & ~used_rows(colors)
             descent = FrameDescent(images[t], start, config, movable_rows, changed_pixels)
             frames.append(descent.run({0: float(unused.float().mean())}))
     return stack(frames, scenes.metadata)

@@ -144,7 +144,7 @@ class _VideoFit:
         return renderer_of(scene, self.config).squared_error(Gaussians.of(scene.field), self.image)
 
     def _fit_anew(self, regions: RegionMap | None) -> Scene:
-        """Fit a frame independently of other frames; unused rows have the colour 0."""
+        """Fit a frame independently of other frames; some rows may stay unused."""
         config = self.config
         if self.frames:  # contours have the softness of the first frame
             config = config.model_copy(update={"softness": 0.0})

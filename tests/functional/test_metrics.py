@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 Metric = Callable[..., Tensor]
 PHOTOS = ("astronaut", "coffee")
 # metrics in torch, of the whole image and along contours
-PLAIN = [metric.function for name, metric in METRICS.items() if not metric.takes_labels and name != "ssimulacra2"]
+PLAIN = [metric.function for metric in METRICS.values() if not metric.takes_labels and not metric.is_optional]
 EDGE_FOCUSED = [metric.function for metric in METRICS.values() if metric.takes_labels]
 
 

@@ -136,7 +136,6 @@ class TestEditing(BaseTester):
                 ValueError,
                 "region_ids must be of regions with pixels in the map; got",
             ),
-            (lambda s: recolor_region(scene_of(RESIZED), BOX, color="red"), ValueError, "must not have a resized map"),
             (lambda s: move_region(scene_of(RESIZED), BOX, (2, 0)), ValueError, "must not have a resized map"),
             (lambda s: render_region(s, BOX, (0, 4)), ValueError, "size must be at least 1 x 1"),
             (lambda s: render_region(Scene(GaussianField.random(3, SIZE), s.regions), BOX), ValueError, "region ids"),
@@ -368,6 +367,17 @@ class TestRecolor:
         for strength, options in ((0.75, {}), (0.2, {"strength": 0.2}), (0.0, {"strength": 0.0})):
             mixed = recolor_region(scene, BOX, color="red", **options)().detach()
             torch.testing.assert_close(mixed, before.lerp(whole, strength), rtol=0, atol=2e-5)
+
+    @pytest.mark.parametrize("name", MAPS)
+    def test_a_resized_map(self, name: str) -> None:
+        """A scene that was enlarged, and then recoloured, is the scene that was recoloured before."""
+        scene = scene_of(MAPS[name]())
+        means, cholesky = scaled_gaussians(scene.field, RESIZED.size)
+        field = GaussianField(means, cholesky, scene.field.colors, ids_of(scene), size=RESIZED.size)
+        enlarged = Scene(field, map_of(scene).resize(RESIZED.size))
+        first, second = (recolor_region(s, BOX, color="red").render(RESIZED.size) for s in (scene, enlarged))
+        assert (first - scene.render(RESIZED.size)).abs().max() > 0.1
+        torch.testing.assert_close(second, first, rtol=0, atol=0.01)
 
 
 class TestDelete:

@@ -1,6 +1,6 @@
 """The context model of label maps: the chances of a pixel's label, given the pixels before it (docs/format.md).
 
-A small network, trained once by `tests/codec/train_prior.py`, gives the first estimate. Counters that learn from the
+A small network, trained once by `models/label_prior.py`, gives the first estimate. Counters that learn from the
 map correct it. All loops compute with integers and are compiled by numba: ``>>`` and ``//`` round down.
 """
 

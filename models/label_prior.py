@@ -1,6 +1,6 @@
 """Train the tables of the label model, `kcgs/codec/labels/scene_prior.bin` and `map_file_prior.bin`, on label maps.
 
-    python tests/codec/train_prior.py MAP... -o FILE [--photos PHOTO...] [--units 48 16] [--steps 8000] [--seed 0]
+    python -m models.label_prior MAP... -o FILE [--photos PHOTO...] [--units 48 16] [--steps 8000] [--seed 0]
 
 Maps are files that `kcgs.data.load_labels` reads. Of each of the photos, and of scikit-image's, segmentations are made,
 of the whole size and of half, and smoothed ones. Synthetic shapes are added. Each map is coded, also mirrored and
@@ -9,7 +9,7 @@ format's rounding is trained on them by Adam and written as integers.
 
 The tables must not change, since all files depend on them. Those of files of maps, `map_file_prior.bin`, were made by
 
-    python tests/codec/train_prior.py -o map_file_prior.bin --units 96 32 --steps 16000 --photos KODAK/kodim*.png
+    python -m models.label_prior -o map_file_prior.bin --units 96 32 --steps 16000 --photos KODAK/kodim*.png
 
 of 14 Kodak photos (02 03 06 07 09 11 12 15 16 18 19 22 23 24). Those of scenes were trained on segmentations of Kodak
 photos and of scikit-image's, and on shapes. The list of those maps is lost, so their exact bytes cannot be made again.
@@ -46,6 +46,7 @@ UNIT = 64  # weights and activations are whole 1 / UNIT
 
 
 def main(arguments: list[str] | None = None) -> None:
+    """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("maps", nargs="*", type=Path, metavar="MAP")
     parser.add_argument("-o", "--output", type=Path, required=True)
@@ -160,6 +161,7 @@ def limits() -> list[tuple[int, int]]:
 
 
 def rounded(values: Tensor, scale: int, most: int) -> Tensor:
+    """Round to whole units."""
     return (values * scale).round().clamp(-most, most) / scale
 
 
