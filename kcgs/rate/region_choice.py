@@ -53,7 +53,7 @@ def choose_regions(problem: Problem, target_bytes: int) -> RegionChoice:
         return _keep_map(problem, regions, target_bytes)
     if reduction_of(min_sigma_of(problem, no_map.num_gaussians)) > 1:
         return no_map._replace(dropped="bytes")
-    return _compare_with(no_map, problem, regions, target_bytes)
+    return _choose_by_trials(no_map, problem, regions, target_bytes)
 
 
 def _keep_map(problem: Problem, regions: RegionMap, target_bytes: int) -> RegionChoice:
@@ -64,7 +64,7 @@ def _keep_map(problem: Problem, regions: RegionMap, target_bytes: int) -> Region
     return RegionChoice(regions, _num_gaussians(problem, target_bytes, regions), problem.config.contour_cost)
 
 
-def _compare_with(no_map: RegionChoice, problem: Problem, regions: RegionMap, target_bytes: int) -> RegionChoice:
+def _choose_by_trials(no_map: RegionChoice, problem: Problem, regions: RegionMap, target_bytes: int) -> RegionChoice:
     """Merge regions that cost more than they save; compare trial fits without a map and with the rest of the map."""
     image = problem.target[0]
     plain_error = _trial_error(problem, None, no_map.num_gaussians)
