@@ -43,7 +43,7 @@ LONGEST = (
     "test_triton.py",
     "cli/test_many.py",
     "kernels/test_cpu.py",
-    "rate/test_budget.py",
+    "rate/test_fitting.py",
     "export/test_web.py",
     "docs/test_pages.py",
     "pipelines/test_torch_transforms.py",

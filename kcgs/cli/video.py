@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from kcgs._atomic import check_writable
 from kcgs._suffixes import VIDEOS, WRITTEN_IMAGES
 
 from . import options
@@ -59,6 +60,9 @@ def fit_video_command(
     output = output or Path(f"{video.stem}.safetensors")
     if output.suffix:  # none: a folder
         check_output(output, ".safetensors")
+    else:  # it is made after the fit, in the first folder above it that exists
+        folder = next(path for path in (output, *output.absolute().parents) if path.exists())
+        check_writable("--output", folder / "00000.safetensors")
     check_new(output, overwrite)
     from kcgs.data import load_labels
     from kcgs.fitting import config_for

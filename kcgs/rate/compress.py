@@ -20,7 +20,7 @@ from kcgs.functional import psnr
 from kcgs.optim import OBJECTIVES, End, ImageObjective, TimedAction, count_iterations, run
 from kcgs.scene import Scene
 
-from .descent import RATE, RateDistortionDescent
+from .rate_distortion import RATE, RateDistortionDescent
 from .rounding import round_gradually
 
 # dB between the scene's PSNR and `quality`: rounding then adds about a 28th to the squared error, 0.15 dB, or more if

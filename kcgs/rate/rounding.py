@@ -10,7 +10,7 @@ import torch
 from kcgs.codec import Classes, Codes
 from kcgs.optim import End, Event, TimedAction, count_iterations, run
 
-from .descent import RATE, RateDistortionDescent
+from .rate_distortion import RATE, RateDistortionDescent
 
 # These numbers are tuned: change one and compare the files of `python -m benchmarks rate`.
 

@@ -16,7 +16,7 @@ from kcgs.optim import Gaussians
 from kcgs.scene import Scene, check_batch
 
 from .background import affine_motions, apply_affine, restore_background
-from .descent import FrameDescent
+from .frame_descent import FrameDescent
 from .stacking import stack
 
 

@@ -22,9 +22,9 @@ from kcgs.nn import clear_lost_rows, pad_rows
 from kcgs.optim import Gaussians
 from kcgs.scene import Scene
 
-from .descent import FrameDescent, renderer_of
 from .files import DEFAULT_FRAME_RATE
 from .flow import move_labels, move_points, optical_flow
+from .frame_descent import FrameDescent, renderer_of
 from .stacking import stack
 
 OnFrame = Callable[[int, Scene], bool | None]
@@ -60,24 +60,24 @@ def fit_video(
 ) -> Scene:
     r"""Fit Gaussians to the frames of a video: the batch dimension is time.
 
-    Convention: row i is the same Gaussian in every frame until it is relocated. The first frame is fitted by
-    :func:`kcgs.fit`. Every other frame starts from the Gaussians of the frame before, moved along the optical flow. A
-    short descent follows: contours move, and the 5 % of the rows with the lowest impact are relocated four times. Where
-    the error has not grown, Gaussians do not move. Unused rows have the colour 0. The first frame after a scene cut is
-    fitted like the first frame, into the same rows. Regions are not merged. Contours keep the softness of the first
-    frame. The same arguments, device and number of threads give the same scenes, bit for bit.
+    Convention: row i is the same Gaussian in every frame, until it is relocated. The first frame is fitted by
+    :func:`kcgs.fit`. Every other frame starts from the Gaussians of the frame before, moved along the optical flow;
+    Gaussians stay where the error has not grown. Then a short descent moves Gaussians and contours. It also relocates
+    the 5 % of the movable rows with the lowest impact to where they lower the error most, four times. The first frame
+    after a scene cut is fitted like the first frame, into the same rows. Rows that a frame does not use have the colour
+    0. Regions are not merged, and contours keep the softness of the first frame. The same arguments, device and number
+    of threads give the same scenes, bit for bit.
 
     Args:
         frames: T images of one size, as :func:`kcgs.fit` takes them, for example from :func:`read_video`; two are in
             memory at a time.
-        label_maps: one map for each frame; or one map of the first frame, :math:`(H, W)`, which moves with the image
-            until a scene cut and then becomes one region. None: one region.
+        label_maps: one map for each frame; or one map of the first frame, :math:`(H, W)`. This one moves with the
+            image until a scene cut; after the cut there is one region. None: one region in all frames.
         num_gaussians: N of every frame; None: one per 100 pixels, at least 100.
-        recipe: of the first frame, and of the first frame after a scene cut. Other frames have a
-            shorter descent of their own, which takes the objective, cutoff, backend, `min_sigma` and the settings of
-            contours.
+        recipe: of the first frame, and of the first frame after a scene cut. The descent of the other frames takes
+            from it the objective, cutoff, backend, `min_sigma` and the settings of contours.
         seed: of the random start.
-        on_frame: called with the number of every frame, from 0, and its scene; returning True ends the fit.
+        on_frame: called after each frame with its number, from 0, and its scene; returning True ends the fit.
         progress: show the number of fitted frames.
         settings: fields of :class:`kcgs.FitConfig`, in place of the recipe's.
 

@@ -132,7 +132,7 @@ class TestSoftBits:
         """A price of bits lowers the error at equal bytes."""
         psnrs = []
         for price in (0.0, 0.9):
-            monkeypatch.setattr("kcgs.rate.descent._BIT_PRICE", price)
+            monkeypatch.setattr("kcgs.rate.rate_distortion._BIT_PRICE", price)
             file = compress(scene, photo[0], target_bytes=1100, iterations=200, objective="l2")
             psnrs.append(psnr(file.scene, photo[0]))
         assert psnrs[0] + 0.05 < psnrs[1]

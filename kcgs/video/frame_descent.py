@@ -36,7 +36,7 @@ _FINAL_ITERATIONS = 20
 _CONTOUR_ITERATION = 30
 # factor by which a move of a contour may raise the squared error around it: Gaussians adapt to it afterwards
 _MAX_RISE = 1.5
-# weight of the error of a row that may not move, so large that the row is never relocated
+# weight of the error of a row that may not move, far above all others: it is relocated only if its colour is 0
 _FIXED_WEIGHT = 1e9
 # usual sum of the weights of all Gaussians at a pixel; where the sum is larger, steps are shorter
 _USUAL_OVERLAP = 12.0

@@ -14,7 +14,7 @@ from kcgs.codec import decode
 from kcgs.fitting.problem import Problem, make_problem
 from kcgs.functional import edge_band
 from kcgs.optim.ms_ssim import MsSsim
-from kcgs.rate import budget, fit_bytes
+from kcgs.rate import fit_bytes, region_choice
 from kcgs.rate.budget import BUDGETS
 from tests.conftest import Clock
 
@@ -115,12 +115,12 @@ class TestFitBytes:
         band = edge_band(labels)
         trials = {True: image + 0.2, False: image + error * band}
 
-        def trial(share: float, problem: Problem) -> Any:
+        def trial(problem: Problem, until: float) -> Any:
             return SimpleNamespace(scene=SimpleNamespace(render=lambda: trials[problem.regions is None]))
 
-        monkeypatch.setattr(budget, "_fit_share", trial)
+        monkeypatch.setattr(region_choice, "fit_problem", trial)
         config = FitConfig(objective="l2")
-        choice = budget._choose_regions(make_problem(image, labels, 1, config, 0), 900)
+        choice = region_choice.choose_regions(make_problem(image, labels, None, config, 0), 900)
         assert (choice.regions is not None) == is_used
 
     @pytest.mark.parametrize(
