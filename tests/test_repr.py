@@ -20,8 +20,8 @@ from kcgs import FitConfig, GaussianField, RegionMap, RegionSplatRenderer, Scene
 from kcgs.data import ChartSample, Davis, DavisFrame, SceneDataset, save_image, save_labels, save_shard
 from kcgs.fitting import FitResult, available_recipes
 from kcgs.fitting.events import Densify
+from kcgs.fitting.gaussian_image import GaussianImageAdan
 from kcgs.fitting.problem import make_problem
-from kcgs.fitting.published.gaussian_image import GaussianImageAdan
 from kcgs.fitting.start import start
 from kcgs.functional import PairSoftness
 from kcgs.rate import Compressed, FitBytesResult

@@ -11,7 +11,7 @@ from kcgs.maps import RegionMap
 from kcgs.nn import GaussianField, pad_rows
 from kcgs.scene import Scene
 
-from .batch_maps import join_maps
+from .problem import join_maps
 
 
 class Best(NamedTuple):

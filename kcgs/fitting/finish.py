@@ -10,10 +10,8 @@ from kcgs.optim import Gaussians
 from kcgs.pruning import PruneResult, prune
 from kcgs.scene import Scene
 
-from .batch_maps import map_of_each
-from .clock import Clock
-from .measurement import Measurement, measure_errors, record, snapshot
-from .problem import Problem
+from .measurement import Clock, Measurement, measure_errors, record, snapshot
+from .problem import Problem, map_of_each
 from .region_report import RegionReport, report_regions
 from .removal import remove_gaussians
 from .result import FitResult

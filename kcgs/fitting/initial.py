@@ -13,8 +13,8 @@ from kcgs._check import check_count
 from kcgs.maps import RegionMap
 from kcgs.nn import GaussianField
 
-from .batch_maps import map_of_each
 from .checks import check_images_and_regions, check_num_gaussians, is_batch
+from .problem import map_of_each
 
 # sum of all weights at a pixel, for Gaussians with a sigma of half their spacing
 _OVERLAP = math.pi / 2

@@ -16,22 +16,23 @@ from kcgs.compiled import threads_for_kernels
 from kcgs.errors import InvalidArgument
 from kcgs.kernels import warm_up
 from kcgs.nn import GaussianField
-from kcgs.optim import End, Event, Loss, run
+from kcgs.optim import End, Event, Loss, TimedAction, run
 
-from .batch_maps import regions_per_map
 from .checkpoint import Checkpoint
-from .clock import Clock
 from .config import FitConfig
-from .events import HandleDivergence, Log, OnStep, Report
+from .events import Densify, HandleDivergence, Log, OnStep, Report, SettleContours, Warmup
 from .finish import finish
-from .problem import Problem, make_problem
+from .measurement import Clock
+from .problem import Problem, make_problem, regions_per_map
 from .result import FitResult
-from .schedule import make_schedule
 from .search import search
 from .start import start
 from .state import FitState
-from .steppers import Stepper, make_stepper
+from .stepper import Stepper, make_stepper
 from .user_objects import Densifier, Initializer, split_names
+
+# share of a fit that renders with the cutoff of a draft
+_DRAFT_SHARE = 0.85
 
 
 @torch.inference_mode(False)
@@ -208,11 +209,22 @@ def _run(
 
     end = End(until, lambda: "seconds" if clock.seconds() >= max_seconds else "iterations")
     report = Report(stepper, clock, bar, on_step, store)
-    schedule, log = make_schedule(state.problem), Log(stepper, clock)
-    events: list[Event] = [report, end, HandleDivergence(stepper), *schedule, log]
+    events: list[Event] = [report, end, HandleDivergence(stepper), *make_schedule(state), Log(stepper, clock)]
     reason = run(state, stepper.step, progress, events, state.optimizer.rate)
     stepper.poll(wait=True)
     return finish(state, reason, clock)
+
+
+def make_schedule(state: FitState) -> list[Event]:
+    """Return the events that change the scene as the settings ask for, in the order in which they act."""
+    config, densify = state.problem.config, state.problem.objects.densify or Densify()
+    events: list[Event] = [TimedAction([_DRAFT_SHARE], state.end_drafts)]
+    if config.warmup:
+        events.append(Warmup())
+    events.append(densify)
+    if config.move_contours:
+        events.append(SettleContours(densify.end))
+    return events
 
 
 def _warn_of_regions(problem: Problem) -> None:

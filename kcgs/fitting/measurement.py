@@ -1,8 +1,9 @@
-"""Measurements of a fit: the errors of its renders, the history, and the best scene of each image."""
+"""Measurements of a fit: its time, the errors of its renders, the history, and the best scene of each image."""
 
 from __future__ import annotations
 
 import copy
+import time
 from typing import NamedTuple
 
 import torch
@@ -15,6 +16,17 @@ from .best import Best
 from .problem import Problem
 from .result import HistoryEntry
 from .state import FitState
+
+
+class Clock:
+    """Wall time of a fit, in seconds; a resumed fit starts at the seconds that it has already used."""
+
+    def __init__(self, seconds: float = 0.0) -> None:
+        self._started = time.perf_counter() - seconds
+
+    def seconds(self) -> float:
+        """Seconds that the fit has used."""
+        return time.perf_counter() - self._started
 
 
 class Measurement(NamedTuple):

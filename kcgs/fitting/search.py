@@ -16,7 +16,7 @@ import torch
 
 from kcgs.functional import psnr
 
-from .clock import Clock
+from .measurement import Clock
 from .problem import Problem
 from .pursuit import add_gaussians
 from .removal import remove_gaussians

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -11,14 +12,14 @@ from torch import Tensor
 from kcgs.functional import choose_softness
 from kcgs.maps import RegionMap, pairs_to_merge
 from kcgs.nn import GaussianField, pad_rows
-from kcgs.optim import Renderer, draft_cutoff
+from kcgs.optim import COLOR_LEARNING_RATE, LEARNING_RATE, FieldOptimizer, GaussianAdam, Renderer, draft_cutoff
 
-from .batch_maps import join_maps, map_of_each, regions_per_map
+from .config import FitConfig
+from .gaussian_image import GaussianImageAdan
 from .initial import initial_sigma, random_field, uniform_field
-from .optimizers import make_optimizer
-from .problem import Problem
+from .problem import Problem, join_maps, map_of_each, regions_per_map
 from .state import FitState
-from .user_objects import check_initial
+from .user_objects import check_initial, check_optimizer
 
 _INITIALIZERS = {"uniform": uniform_field, "random": random_field}
 
@@ -65,6 +66,29 @@ def make_state(
     renderer = Renderer(problem.size, regions, cutoff, config.backend, problem.bounds)
     progress = {"num_requested": num_initial, **progress}
     return FitState(field, optimizer, problem.objective, renderer, problem=problem, num_initial=num_initial, **progress)
+
+
+def make_optimizer(problem: Problem, field: GaussianField, sigma: float) -> FieldOptimizer:
+    """Return the optimizer of a field whose Gaussians begin with `sigma`, in pixels."""
+    if problem.objects.optimizer is not None:
+        return check_optimizer(problem.objects.optimizer(field), problem.num_images)
+    return _OPTIMIZERS[problem.config.optimizer](problem.config, field, sigma)
+
+
+def _gaussian_adam(config: FitConfig, field: GaussianField, sigma: float) -> GaussianAdam:
+    factor = config.learning_rate_factor
+    rate, color_rate = LEARNING_RATE * factor, COLOR_LEARNING_RATE * factor
+    return GaussianAdam(field, rate, color_lr=color_rate, min_sigma=config.min_sigma, bounded=config.bounded)
+
+
+def _adan(config: FitConfig, field: GaussianField, sigma: float) -> GaussianImageAdan:
+    return GaussianImageAdan(field, sigma, config.planned_iterations, config.learning_rate_factor)
+
+
+_OPTIMIZERS: dict[str, Callable[[FitConfig, GaussianField, float], FieldOptimizer]] = {
+    "gaussian-adam": _gaussian_adam,
+    "adan": _adan,
+}
 
 
 def _regions_to_render(problem: Problem) -> RegionMap | None:

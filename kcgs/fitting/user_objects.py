@@ -10,7 +10,7 @@ from torch import Tensor
 from kcgs.errors import InvalidArgument
 from kcgs.maps import RegionMap
 from kcgs.nn import GaussianField
-from kcgs.optim import Event, FieldOptimizer, Loss
+from kcgs.optim import FieldOptimizer, Loss
 
 Initializer = Callable[[Tensor, int, RegionMap | None, int], GaussianField]
 _OPTIMIZER_MEMBERS = tuple(name for name in vars(FieldOptimizer) if not name.startswith("_"))
@@ -19,11 +19,8 @@ _BATCH_MEMBERS = ("freeze", "frozen_rows")
 
 
 @runtime_checkable
-class Densifier(Event, Protocol):
+class Densifier(Protocol):
     """An event that adds Gaussians to a fit: the argument `densify` of :func:`kcgs.fit`.
-
-    ``act(state)`` is called before every step with the :class:`FitState`. It decides by ``state.progress`` whether to
-    add Gaussians. If it returns a string, the fit ends with this reason.
 
     Example:
         >>> import torch
@@ -43,6 +40,12 @@ class Densifier(Event, Protocol):
     @property
     def end(self) -> float:
         """Share of the fit at the last addition; afterwards contours still move a few times."""
+
+    def act(self, state: Any) -> str | None:
+        """Add Gaussians to a :class:`FitState`, if ``state.progress`` says that it is time to.
+
+        The fit calls it before every step. If it returns a string, the fit ends with this reason.
+        """
 
 
 class UserObjects(NamedTuple):

@@ -153,7 +153,10 @@ class GaussianAdam(Optimizer):
             received = {name: tuple(table.shape) for name, table in averages.items()}
             if received and received != expected:
                 raise InvalidArgument("state_dict", f"of {expected}", received)
+        sizes = [group["size"] for group in self.param_groups[::2]]
         super().load_state_dict(state_dict)
+        for group, size in zip(self.param_groups[::2], sizes, strict=True):
+            group["size"] = size  # of the field, not of the field that the state is of
 
     @torch.no_grad()
     def append(self, field: GaussianField, added: GaussianField) -> None:
@@ -166,8 +169,7 @@ class GaussianAdam(Optimizer):
         Raises:
             ValueError: a field that the optimizer was not made for, or Gaussians that do not fit to it.
         """
-        if _layout(field) != _layout(added):
-            raise InvalidArgument("added", _layout(field), _layout(added), verb="have")
+        check_added(field, added)
         geometry = self._group(field)
         means, cholesky = within_bounds(added.means, added.cholesky, bounds_of(geometry))
         colors = added.colors.clamp(*COLOR_RANGE) if geometry["bounded"] else added.colors
@@ -194,21 +196,14 @@ class GaussianAdam(Optimizer):
                 Gaussians in one image than in another.
         """
         self._group(field)
-        _check_mask(mask, field.means.shape[-2:-1], field.means.shape[:-1])
-        index = mask.nonzero()[:, -1]
-        if mask.ndim == 2:
-            counts = mask.sum(1)
-            if not bool((counts == counts[0]).all()):
-                raise InvalidArgument("mask", "of as many Gaussians in each image", counts.tolist())
-            index = index.view(len(mask), -1)
+        index, rows = rows_of(field, mask), field.means.ndim - 2
         for name in ("means", "cholesky", "colors", "opacities"):
             if (value := getattr(field, name)) is not None:
-                self._replace(field, name, _select_rows(value, index, field.means.ndim - 2))
+                self._replace(field, name, select_rows(value, index, rows))
         if field.region_ids is not None:
-            field.region_ids = _select_rows(field.region_ids, index, field.region_ids.ndim - 1)
+            field.region_ids = select_rows(field.region_ids, index, rows)
         for state in self._states(field):
-            rows = {name: _select_rows(average, index, average.ndim - 2) for name, average in state.items()}
-            state.update(rows)
+            state.update({name: select_rows(average, index, rows) for name, average in state.items()})
 
     @torch.no_grad()
     def freeze(self, field: GaussianField, mask: Tensor) -> None:
@@ -231,7 +226,7 @@ class GaussianAdam(Optimizer):
             tensor([False,  True,  True,  True])
         """
         geometry = self._group(field)
-        _check_mask(mask, field.means.shape[:-1])
+        check_mask(mask, field.means.shape[:-1])
         colors = next(group for group in self.param_groups if group["params"][0] is field.colors)
         for group in (geometry, colors):
             state = self.state[group["params"][0]]
@@ -264,6 +259,12 @@ class GaussianAdam(Optimizer):
         return (self.state[tensor] for tensor in (field.means, field.colors) if tensor in self.state)
 
 
+def check_added(field: GaussianField, added: GaussianField) -> None:
+    """Validate that Gaussians may be added to a field: the same batch, channels, and optional tables."""
+    if _layout(field) != _layout(added):
+        raise InvalidArgument("added", _layout(field), _layout(added), verb="have")
+
+
 def _layout(field: GaussianField) -> str:
     """Describe what another field must have to be added to a field."""
     *batch, _, channels = field.colors.shape
@@ -271,13 +272,26 @@ def _layout(field: GaussianField) -> str:
     return " and ".join([f"colors ({', '.join(map(str, [*batch, 'N', channels]))})", *optional])
 
 
-def _check_mask(mask: Tensor, *shapes: torch.Size) -> None:
+def check_mask(mask: Tensor, *shapes: torch.Size) -> None:
+    """Validate a mask of Gaussians, which has one of several shapes."""
     if mask.dtype != torch.bool or mask.shape not in shapes:
         expected = " or ".join(str(tuple(shape)) for shape in dict.fromkeys(shapes))
         raise InvalidArgument("mask", f"boolean, {expected}", f"{mask.dtype}, {tuple(mask.shape)}")
 
 
-def _select_rows(table: Tensor, index: Tensor, rows: int) -> Tensor:
+def rows_of(field: GaussianField, mask: Tensor) -> Tensor:
+    """Return the numbers of a mask's rows: (N') of a mask for all images, (B, N') of a mask for each image."""
+    check_mask(mask, field.means.shape[-2:-1], field.means.shape[:-1])
+    index = mask.nonzero()[:, -1]
+    if mask.ndim == 1:
+        return index
+    counts = mask.sum(1)
+    if not bool((counts == counts[0]).all()):
+        raise InvalidArgument("mask", "of as many Gaussians in each image", counts.tolist())
+    return index.view(len(mask), -1)
+
+
+def select_rows(table: Tensor, index: Tensor, rows: int) -> Tensor:
     """Select rows, which are dimension `rows` of a table; `index` is (N',) for all images, or (B, N')."""
     if index.ndim == 1:
         return table.index_select(rows, index)

@@ -14,6 +14,8 @@ from torch.optim import Optimizer
 from kcgs.errors import InvalidArgument
 from kcgs.nn import GaussianField
 
+from .gaussian_adam import check_added, check_mask, rows_of, select_rows
+
 
 class ReparametrizedOptimizer(ABC):
     """A torch optimizer that moves parameters of its own, and writes the Gaussians that they stand for into a field.
@@ -96,7 +98,9 @@ class ReparametrizedOptimizer(ABC):
             tensor.grad = None
 
     def append(self, field: GaussianField, added: GaussianField) -> None:
-        """Add the Gaussians of another field."""
+        """Add Gaussians to the optimizer's field: see :meth:`kcgs.optim.GaussianAdam.append`."""
+        self._check_field(field)
+        check_added(field, added)
         if field.region_ids is not None and added.region_ids is not None:
             field.region_ids = torch.cat([field.region_ids, added.region_ids], -1)
         if self.frozen is not None:
@@ -105,24 +109,25 @@ class ReparametrizedOptimizer(ABC):
         self._set([torch.cat([old.detach(), new.detach()], -2) for old, new in pairs])
 
     def keep(self, field: GaussianField, mask: Tensor) -> None:
-        """Remove all Gaussians but those of a mask, :math:`(..., N)`."""
-
-        def select(table: Tensor) -> Tensor:
-            return table[mask].view(*mask.shape[:-1], -1, table.shape[-1])
-
+        """Remove all Gaussians but those of a mask: see :meth:`kcgs.optim.GaussianAdam.keep`."""
+        self._check_field(field)
+        index, rows = rows_of(field, mask), field.means.ndim - 2
         if field.region_ids is not None:
-            field.region_ids = select(field.region_ids[..., None])[..., 0]
+            field.region_ids = select_rows(field.region_ids, index, rows)
         if self.frozen is not None:
-            self.frozen = select(self.frozen)
-        self._set([select(old.detach()) for old in self.parameters])
+            self.frozen = select_rows(self.frozen, index, rows)
+        self._set([select_rows(old.detach(), index, rows) for old in self.parameters])
 
     def freeze(self, field: GaussianField, mask: Tensor) -> None:
         """Leave Gaussians of a mask, :math:`(..., N)`, as they are from here on."""
+        self._check_field(field)
+        check_mask(mask, field.means.shape[:-1])
         self.frozen = mask[..., None] if self.frozen is None else self.frozen | mask[..., None]
         self._set(self.encode(field))
 
     def frozen_rows(self, field: GaussianField) -> Tensor:
         """Return the mask of the Gaussians that `freeze` has frozen, :math:`(..., N)`."""
+        self._check_field(field)
         none = torch.zeros_like(field.means[..., 0], dtype=torch.bool)
         return none if self.frozen is None else self.frozen[..., 0]
 
@@ -136,6 +141,10 @@ class ReparametrizedOptimizer(ABC):
         self.frozen = state.get("frozen")  # version 0.3 froze none
         self._set(state["parameters"])
         self.optimizer.load_state_dict(state["optimizer"])
+
+    def _check_field(self, field: GaussianField) -> None:
+        if field is not self.field:
+            raise InvalidArgument("field", "the one that the optimizer was made for", "another")
 
     def _set(self, parameters: list[Tensor]) -> None:
         self.parameters = [p.detach().clone().requires_grad_() for p in parameters]

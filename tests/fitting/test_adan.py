@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kcgs.fitting.published.adan import Adan
+from kcgs.fitting.gaussian_image import Adan
 
 Array = NDArray[np.float64]
 START = np.array([-1.2, 1.0, 0.3, -0.7])

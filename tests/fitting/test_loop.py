@@ -15,10 +15,9 @@ from torch import Tensor
 from kcgs import FitConfig, GaussianField, RegionMap, fit
 from kcgs.data import chart_2x3, chart_pie
 from kcgs.fitting import available_recipes
-from kcgs.fitting.events import contours
+from kcgs.fitting.events import Warmup, contours
+from kcgs.fitting.gaussian_image import GaussianImageAdan
 from kcgs.fitting.problem import make_problem
-from kcgs.fitting.published.gaussian_image import GaussianImageAdan
-from kcgs.fitting.published.warmup import Warmup
 from kcgs.fitting.start import start
 from kcgs.functional import ef_psnr, psnr
 from kcgs.optim import Renderer

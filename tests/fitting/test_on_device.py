@@ -20,9 +20,8 @@ from kcgs.fitting.events import contours
 from kcgs.fitting.measurement import Errors, measure_errors
 from kcgs.fitting.problem import make_problem
 from kcgs.fitting.state import FitState
-from kcgs.fitting.steppers import CudaStepper, EagerStepper
-from kcgs.fitting.steppers.graph import StepGraph
-from kcgs.fitting.steppers.readback import Readback
+from kcgs.fitting.stepper import EagerStepper
+from kcgs.fitting.stepper_cuda import CudaStepper, Readback, StepGraph
 from kcgs.functional import PairSoftness, contour_fit
 from kcgs.kernels.cuda.capacity import reports
 from kcgs.optim import adam

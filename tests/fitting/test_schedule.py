@@ -12,11 +12,10 @@ import torch
 from kcgs import FitConfig, RegionMap
 from kcgs.fitting.contour_moves import accept_moves
 from kcgs.fitting.events import Densify, SettleContours
-from kcgs.fitting.optimizers import make_optimizer
+from kcgs.fitting.loop import make_schedule
 from kcgs.fitting.problem import make_problem
 from kcgs.fitting.result import HistoryEntry
-from kcgs.fitting.schedule import make_schedule
-from kcgs.fitting.start import start
+from kcgs.fitting.start import make_optimizer, start
 from kcgs.fitting.state import FitState
 from kcgs.nn import GaussianField
 
@@ -99,12 +98,12 @@ class TestEvents:
     @pytest.mark.parametrize(
         ("settings", "names"),
         [
-            ({}, ["EndDrafts", "Densify", "SettleContours"]),
-            ({"warmup": True, "move_contours": False}, ["EndDrafts", "Warmup", "Densify"]),
+            ({}, ["TimedAction", "Densify", "SettleContours"]),
+            ({"warmup": True, "move_contours": False}, ["TimedAction", "Warmup", "Densify"]),
         ],
     )
     def test_are_those_of_the_settings(self, settings: dict[str, Any], names: list[str]) -> None:
-        assert [type(event).__name__ for event in make_schedule(state_of(10, **settings).problem)] == names
+        assert [type(event).__name__ for event in make_schedule(state_of(10, **settings))] == names
 
     def test_late_moves_are_even(self) -> None:
         state, event, counts = state_of(10), SettleContours(after=0.5), []

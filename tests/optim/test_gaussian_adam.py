@@ -229,6 +229,15 @@ class TestProtocol:
         with pytest.raises(ValueError, match=r"state_dict must be of {'age': \(20, 1\), 'average': .*; got {'age': "):
             GaussianAdam(field_of()).load_state_dict(optimizer.state_dict())
 
+    def test_a_state_of_a_field_of_another_size(self) -> None:
+        """The field keeps its own size, to which its centres are bound."""
+        large = GaussianField.random(20, (240, 360))
+        optimizer = GaussianAdam(field := field_of(), bounded=True)
+        optimizer.load_state_dict(GaussianAdam(large, bounded=True).state_dict())
+        field.means.data[-1] = 300.0
+        descend(field, optimizer, 1)
+        assert field.means[-1].tolist() == [SIZE[1], SIZE[0]]
+
     def test_other_parameters(self) -> None:
         with pytest.raises(ValueError, match="param_group must be a GaussianField's: train other parameters with"):
             GaussianAdam(field_of()).add_param_group({"params": [torch.zeros(3, requires_grad=True)]})

@@ -1,7 +1,10 @@
-"""ReparametrizedOptimizer: what a checkpoint stores."""
+"""ReparametrizedOptimizer: what a checkpoint stores, and the fields that it takes."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import pytest
 import torch
 from torch import Tensor
 
@@ -36,3 +39,40 @@ def test_frozen_rows_stay_frozen_in_a_state() -> None:
         table.grad = torch.ones_like(table)
     resumed.step()
     assert torch.equal((twin.means != before).any(-1), ~mask)
+
+
+ALL = torch.ones(5, dtype=torch.bool)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda optimizer, field: optimizer.append(field, field),
+        lambda optimizer, field: optimizer.keep(field, ALL),
+        lambda optimizer, field: optimizer.freeze(field, ALL),
+        lambda optimizer, field: optimizer.frozen_rows(field),
+    ],
+)
+def test_another_field(change: Callable[[PlainOptimizer, GaussianField], object]) -> None:
+    field, other = (GaussianField.random(5, (16, 24), seed=0) for _ in range(2))
+    with pytest.raises(ValueError, match="field must be the one that the optimizer was made for; got another"):
+        change(make(field), other)
+    assert field.num_gaussians == other.num_gaussians == 5
+
+
+def test_rows_of_another_kind() -> None:
+    field = GaussianField.random(5, (16, 24), seed=0)
+    optimizer = make(field)
+    with pytest.raises(ValueError, match=r"added must have colors \(N, 3\); got colors \(N, 1\)"):
+        optimizer.append(field, GaussianField.random(2, (16, 24), channels=1, seed=0))
+    with pytest.raises(ValueError, match=r"mask must be boolean, \(5,\); got torch"):
+        optimizer.keep(field, ALL[:3])
+    assert field.num_gaussians == 5
+
+
+def test_keep_takes_a_mask_for_all_images_of_a_batch() -> None:
+    batch = GaussianField.stack([GaussianField.random(5, (16, 24), seed=k) for k in range(2)])
+    expected, mask = batch.means.detach()[:, 1:4], torch.tensor([False, True, True, True, False])
+    optimizer = make(batch)
+    optimizer.keep(batch, mask)
+    assert torch.equal(batch.means.detach(), expected)

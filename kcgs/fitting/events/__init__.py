@@ -7,9 +7,7 @@ An event that changes the scene is a frozen dataclass, and its fields are thresh
 
 from .contours import SettleContours
 from .densify import Densify
-from .divergence import HandleDivergence
-from .drafts import EndDrafts
-from .log import Log
-from .report import OnStep, Report
+from .observers import HandleDivergence, Log, OnStep, Report
+from .warmup import Warmup
 
-__all__ = ["Densify", "EndDrafts", "HandleDivergence", "Log", "OnStep", "Report", "SettleContours"]
+__all__ = ["Densify", "HandleDivergence", "Log", "OnStep", "Report", "SettleContours", "Warmup"]

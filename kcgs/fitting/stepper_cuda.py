@@ -6,22 +6,100 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from operator import is_not
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from kcgs.fitting.measurement import Errors, Measurement, measure_errors, record, snapshot
-from kcgs.fitting.state import LARGEST, FitState
 from kcgs.kernels import settle, without_waiting
-from kcgs.optim import move_field, set_rates
+from kcgs.optim import FieldState, move_field, set_rates
 
-from .graph import StepGraph
-from .readback import Readback
+from .measurement import Errors, Measurement, measure_errors, record, snapshot
+from .state import LARGEST, FitState
 
 # first iterations of a fit, in which the host waits: Gaussians may grow faster than the room for their lists
 _CHECKED_ITERATIONS = 20
 # iterations between two checks of divergence: the host is at most twice as many iterations ahead of the device
 _ITERATIONS_PER_CHECK = 10
+
+
+class Readback:
+    """A small tensor on its way to the host, which does not wait; a tensor on the CPU has arrived at once."""
+
+    def __init__(self, numbers: Tensor) -> None:
+        # CUDA copies into pinned memory, after the work that the device has queued before
+        self._numbers = numbers.detach().to("cpu", non_blocking=numbers.is_cuda)
+        self._copied: torch.cuda.Event | None = None
+        if numbers.is_cuda:
+            with torch.cuda.device_of(numbers):
+                self._copied = torch.cuda.Event()
+                self._copied.record()
+
+    def has_arrived(self) -> bool:
+        """True once `numbers` returns without waiting."""
+        return self._copied is None or self._copied.query()
+
+    def numbers(self) -> Tensor:
+        """Return the numbers in float64 on the host, and wait for them where they have not arrived."""
+        if self._copied is not None:
+            self._copied.synchronize()
+        return self._numbers.double()
+
+
+class StepGraph:
+    """A gradient and a step of the optimizer, captured once and then replayed.
+
+    A capture is valid until an event replaces a tensor of the fit or its cutoff. The first call takes its step without
+    a capture, since programs cannot be compiled during one.
+    """
+
+    def __init__(self) -> None:
+        self._graph: Any = None
+        self._is_valid = False
+        self._rates: list[Tensor] = []
+
+    def forget(self) -> None:
+        """Capture again at the next call."""
+        self._is_valid = False
+
+    def step(self, state: FieldState) -> None:
+        """Take a step with the current learning rates."""
+        device, groups, is_first = state.field.means.device, state.optimizer.param_groups, not self._rates
+        if is_first:
+            self._rates = [torch.empty((), device=device) for _ in groups]
+        elif not self._is_valid:
+            self._graph, self._is_valid = self.record(lambda: self._move(state), device), True
+        for rate, group in zip(self._rates, groups, strict=True):
+            rate.fill_(group["lr"])
+        if is_first:
+            self._move(state)
+        else:
+            self._graph.replay()
+
+    def _move(self, state: FieldState) -> None:
+        """Take a step that reads the learning rates from the tensors that a replay reads."""
+        groups = state.optimizer.param_groups
+        numbers = [group["lr"] for group in groups]
+        for group, rate in zip(groups, self._rates, strict=True):
+            group["lr"] = rate
+        move_field(state)
+        for group, number in zip(groups, numbers, strict=True):
+            group["lr"] = number
+
+    def record(self, move: Callable[[], None], device: torch.device) -> Any:
+        """Capture a step in the memory of the previous graph; that graph is not replayed again."""
+        with torch.cuda.device(device):
+            graph, stream, current = torch.cuda.CUDAGraph(), torch.cuda.Stream(), torch.cuda.current_stream()
+            stream.wait_stream(current)
+            with torch.cuda.stream(stream):
+                # thread_local: other threads may use the device during the capture
+                graph.capture_begin(None if self._graph is None else self._graph.pool(), "thread_local")
+                try:
+                    move()
+                finally:
+                    graph.capture_end()
+            current.wait_stream(stream)
+        return graph
 
 
 class CudaStepper:

@@ -1,4 +1,4 @@
-"""The protocol of steppers, and the stepper that waits for each step."""
+"""Steps and measurements of a fit: their protocol, and the stepper that waits for each step."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from typing import Protocol
 
 from torch import Tensor
 
-from kcgs.fitting.measurement import measure_errors, record, snapshot
-from kcgs.fitting.state import FitState
-from kcgs.optim import step_field
+from kcgs.optim import GaussianAdam, step_field
+
+from .measurement import measure_errors, record, snapshot
+from .state import FitState
+from .stepper_cuda import CudaStepper
 
 
 class Stepper(Protocol):
@@ -51,3 +53,13 @@ class EagerStepper:
     def overflowing_images(self) -> list[int]:
         """See :class:`Stepper`."""
         return self._state.overflowing_images()
+
+
+def make_stepper(state: FitState) -> Stepper:
+    """Return the stepper of a fit's device and optimizer.
+
+    On a GPU the host does not wait for steps of GaussianAdam. A step that finds no room on the device has gradients of
+    NaN: GaussianAdam skips them, other optimizers do not.
+    """
+    runs_ahead = state.problem.device.type == "cuda" and isinstance(state.optimizer, GaussianAdam)
+    return CudaStepper(state) if runs_ahead else EagerStepper(state)
