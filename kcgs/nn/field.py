@@ -39,8 +39,9 @@ class GaussianField(nn.Module):
         cholesky: factors (l11, l21, l22) in pixels, l11, l22 > 0, :math:`(N, 3)` or :math:`(B, N, 3)`.
         colors: any range, :math:`(N, C)` or :math:`(B, N, C)`.
         region_ids: integer, non-negative, :math:`(N)` or :math:`(B, N)`; None: not confined.
-        opacities: the paper's alpha, :math:`(N)` or :math:`(B, N)`, multiplied into the colours when rendered; None:
-            already multiplied.
+        opacities: the paper's alpha, :math:`(N)` or :math:`(B, N)`; None: already multiplied into the colours. A field,
+            edits and .safetensors files keep them beside the colours; renders, fits, shards and .kcgs files multiply
+            them into the colours.
         size: (height, width) of the image that the pixel units refer to.
 
     Raises:
@@ -303,6 +304,13 @@ class GaussianField(nn.Module):
     def merged_colors(self) -> Tensor:
         """Return the colours with the opacities multiplied in, (N, C) or (B, N, C)."""
         return self.colors if self.opacities is None else self.colors * self.opacities[..., None]
+
+    def without_opacities(self) -> GaussianField:
+        """Return the field itself; with opacities, a copy of parameters with merged colours, without the graph."""
+        if self.opacities is None:
+            return self
+        means, cholesky, colors = self.means.detach(), self.cholesky.detach(), self.merged_colors().detach()
+        return GaussianField(means, cholesky, colors, self.region_ids, size=self.size)
 
     def get_extra_state(self) -> dict[str, tuple[int, int]]:
         """Return the size, for `state_dict`."""
