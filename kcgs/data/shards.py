@@ -19,7 +19,7 @@ from kcgs.errors import InvalidArgument
 from kcgs.functional import RegionMap, to_tokens
 from kcgs.nn import GaussianField, pad_rows
 from kcgs.scene import Scene, check_batch
-from kcgs.storage import MappedScene, map_file
+from kcgs.storage import Shard, map_file
 
 # digits in the names of shards
 _DIGITS = 5
@@ -92,7 +92,7 @@ class SceneDataset(Dataset[Scene]):
         self._paths = list_shards(folder)
         if not self._paths:
             raise FileNotFoundError(f"folder must hold shards, such as 00000.safetensors; got {str(folder)!r}")
-        self._open: dict[int, MappedScene] = {}
+        self._open: dict[int, Shard] = {}
         self.names, psnrs, counts = [], [], []
         for number in range(len(self._paths)):
             names, psnr = shard_contents(self._shard(number).metadata, self._paths[number])
@@ -155,7 +155,7 @@ class SceneDataset(Dataset[Scene]):
         """Leave out the open files."""
         return {**self.__dict__, "_open": {}}
 
-    def _shard(self, number: int) -> MappedScene:
+    def _shard(self, number: int) -> Shard:
         """Return a shard, opened once per process."""
         if number not in self._open:
             self._open[number] = map_file(self._paths[number])

@@ -221,9 +221,9 @@ class GaussianField(nn.Module):
         for field in fields:
             if not isinstance(field, GaussianField):
                 raise InvalidArgumentType("fields", "GaussianFields", type(field).__name__)
-            if field.num_images is not None or _describe(field) != _describe(fields[0]):
-                expected = f"of one image each and alike, the first with {_describe(fields[0])}"
-                raise InvalidArgument("fields", expected, f"one with {_describe(field)}")
+            if field.num_images is not None or field.extra_repr() != fields[0].extra_repr():
+                expected = f"of one image each and alike, the first with {fields[0].extra_repr()}"
+                raise InvalidArgument("fields", expected, f"one with {field.extra_repr()}")
         if not fields:
             raise InvalidArgument("fields", "at least one", "none", verb="hold")
         columns = ([getattr(field, name) for field in fields] for name in _TABLES)
@@ -271,9 +271,7 @@ class GaussianField(nn.Module):
         return cls(*from_tokens(tokens, size), region_ids, size=size)
 
     def hflip(self) -> GaussianField:
-        """Return the field of the image that is flipped left to right, exactly, with the graph.
-
-        A label map is flipped by ``labels.flip(-1)``.
+        """Return the field of the image flipped left to right, exactly, with the graph; flip a map by `labels.flip(-1)`.
 
         Example:
             >>> from kcgs import Scene
@@ -347,8 +345,6 @@ class GaussianField(nn.Module):
         """Show the numbers that matter."""
         confined = "confined" if self.region_ids is not None else "not confined"
         images = "" if self.num_images is None else f"{self.num_images} x "
-        return f"{images}{self.num_gaussians} Gaussians, {self.colors.shape[-1]} channels, size={self.size}, {confined}"
-
-
-def _describe(field: GaussianField) -> str:
-    return f"{field.extra_repr()}, {'no ' if field.opacities is None else ''}opacities"
+        opacities = "" if self.opacities is None else ", with opacities"
+        channels = self.colors.shape[-1]
+        return f"{images}{self.num_gaussians} Gaussians, {channels} channels, size={self.size}, {confined}{opacities}"
