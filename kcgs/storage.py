@@ -71,7 +71,7 @@ def deserialize(data: bytes) -> Scene:
         raise ValueError(str(error)) from error
 
 
-class MappedScene:
+class Shard:
     """A batch of scenes in a .safetensors file; its tensors are mapped into memory and read on use.
 
     The checksum is not verified, since this would read the whole file; `deserialize` verifies it.
@@ -109,7 +109,7 @@ class MappedScene:
         return Scene(field, regions)
 
 
-def map_file(path: str | os.PathLike[str]) -> MappedScene:
+def map_file(path: str | os.PathLike[str]) -> Shard:
     """Map a batch of scenes in a .safetensors file into memory; raise ValueError if the file has no batch."""
     try:
         with safetensors.safe_open(path, "pt") as file:
@@ -121,7 +121,7 @@ def map_file(path: str | os.PathLike[str]) -> MappedScene:
             raise ValueError("shards hold no opacities: kcgs.data.save_shard merges them into the colours")
         header = json.loads(notes[FORMAT])
         _check_version(header)
-        return MappedScene(tensors, header)
+        return Shard(tensors, header)
     except (KeyError, safetensors.SafetensorError, TypeError, ValueError) as error:
         raise ValueError(f"{path} holds no batch of scenes: {error}") from error
 

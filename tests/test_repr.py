@@ -60,7 +60,7 @@ def objects(result: FitResult, folder: Path) -> Iterator[Any]:
     batch = Scene(GaussianField.stack([field] * 3), LABELS.expand(3, -1, -1))
     save_shard(folder / "00000.safetensors", batch, ["a long name " * 9] * 3, [30.0] * 3)
     dataset = SceneDataset(folder)
-    yield from (dataset, dataset.__getitems__([0, 2]))
+    yield from (dataset, dataset.batch([0, 2]))
     yield from (ChartSample(image, LABELS), DavisFrame("bear", image, LABELS))
     for kind in ("JPEGImages", "Annotations"):
         (folder / kind / "480p" / "bear").mkdir(parents=True)

@@ -1,4 +1,9 @@
-"""Images and label maps on disk, label maps in colours, charts, DAVIS, and data sets of scenes."""
+"""Images and label maps on disk, and data sets of scenes.
+
+`load_image` and `load_labels` read what a fit takes; `colorize_labels` and `overlay_labels` show a label map. The
+charts, and `Davis` for your copy of that data set, are images with label maps, to try and measure fits. `save_shard`
+writes a shard: a file with the scenes of many images. `SceneDataset` reads a folder of shards, to train networks.
+"""
 
 from .charts import ChartSample, chart_2x3, chart_pie
 from .colors import colorize_labels, label_colors, overlay_labels

@@ -20,7 +20,7 @@ from kcgs.functional import to_tokens
 from kcgs.maps import RegionMap
 from kcgs.nn import GaussianField, pad_rows
 from kcgs.scene import Scene, check_batch
-from kcgs.storage import MappedScene, map_file
+from kcgs.storage import Shard, map_file
 
 # digits in the names of shards
 _DIGITS = 5
@@ -59,9 +59,9 @@ class SceneBatch(NamedTuple):
 class SceneDataset(Dataset[Scene]):
     r"""The scenes in the shards of a folder, as `kcgs fit-many --shard` writes them: a torch Dataset.
 
-    Convention: an index gives a scene, without unused rows. Batches come as tensors, by torch's
-    ``__getitems__``: pass :meth:`collate` to a DataLoader. Files are mapped into memory, so that only the requested
-    rows are read. A copy in another process, spawned or forked, opens the files itself.
+    Convention: ``dataset[k]`` is a :class:`kcgs.Scene`; ``dataset.batch(indices)``, and a DataLoader with
+    ``collate_fn=dataset.collate``, give a :class:`SceneBatch` of tensors. Files are mapped into memory, so that only
+    the requested rows are read. A copy in another process, spawned or forked, opens the files itself.
 
     Args:
         folder: has 00000.safetensors, 00001.safetensors and so on, all with the same numbers of rows and channels.
@@ -93,7 +93,7 @@ class SceneDataset(Dataset[Scene]):
         self._paths = list_shards(folder)
         if not self._paths:
             raise FileNotFoundError(f"folder must hold shards, such as 00000.safetensors; got {str(folder)!r}")
-        self._open: dict[int, MappedScene] = {}
+        self._open: dict[int, Shard] = {}
         self.names, psnrs, counts = [], [], []
         for number in range(len(self._paths)):
             names, psnr = shard_contents(self._shard(number).metadata, self._paths[number])
@@ -126,22 +126,26 @@ class SceneDataset(Dataset[Scene]):
         number = int(torch.searchsorted(self._firsts, position, right=True)) - 1
         return self._shard(number).scene(position - int(self._firsts[number]))
 
-    def __getitems__(self, indices: Sequence[int]) -> SceneBatch:
-        """Return scenes as tensors, in the order of the indices; a DataLoader calls this."""
+    def batch(self, indices: Sequence[int]) -> SceneBatch:
+        """Return scenes as tensors, in the order of the indices, at least one."""
+        if not len(indices):
+            raise InvalidArgument("indices", "at least one", "none", verb="hold")
         positions = torch.tensor([range(len(self))[operator.index(index)] for index in indices])
         numbers = torch.searchsorted(self._firsts, positions, right=True) - 1
         rows = positions - self._firsts[numbers]
         place = numbers.argsort(stable=True).argsort()  # of each scene, where the scenes are sorted by their shards
+        chosen = [(self._shard(number), rows[numbers == number]) for number in numbers.unique().tolist()]
 
         def table(name: str) -> Tensor:
-            chosen = [(self._shard(number), rows[numbers == number]) for number in numbers.unique().tolist()]
-            parts = [shard.tensors[name].index_select(0, indices) for shard, indices in chosen]
+            parts = [shard.tensors[name].index_select(0, rows_of_shard) for shard, rows_of_shard in chosen]
             # each shard has the smallest integer type that holds its ids
             return torch.cat([part.long() if name == "region_ids" else part for part in parts])[place]
 
         sizes = torch.tensor([self._shard(number).size for number in numbers.tolist()]).view(-1, 2)
         ids = table("region_ids") if "region_ids" in self._shard(0).tensors else None
         return SceneBatch(positions, sizes, table("means"), table("cholesky"), table("colors"), ids)
+
+    __getitems__ = batch  # a DataLoader calls it
 
     @staticmethod
     def collate(batch: SceneBatch) -> SceneBatch:
@@ -152,7 +156,7 @@ class SceneDataset(Dataset[Scene]):
         """Leave out the open files."""
         return {**self.__dict__, "_open": {}}
 
-    def _shard(self, number: int) -> MappedScene:
+    def _shard(self, number: int) -> Shard:
         """Return a shard, opened once per process."""
         if number not in self._open:
             self._open[number] = map_file(self._paths[number])
@@ -213,9 +217,7 @@ def save_shard(
     # JSON has no infinity, the PSNR of an image without error
     finite = [None if number == math.inf else number for number in numbers]
     notes = {**scenes.metadata, **(metadata or {}), "names": json.dumps([*map(str, names)]), "psnr": json.dumps(finite)}
-    field = scenes.field
-    field = GaussianField(field.means, field.cholesky, field.merged_colors(), field.region_ids, size=field.size)
-    return Scene(field, scenes.regions, notes).save(path)
+    return Scene(scenes.field.without_opacities(), scenes.regions, notes).save(path)
 
 
 def shard_contents(metadata: Mapping[str, str], path: Path) -> tuple[list[str], list[float]]:

@@ -92,7 +92,7 @@ def fit(
         initializer: the first Gaussians, by a name of :class:`FitConfig`; or a function of the images,
             :math:`(B, C, H, W)` (grey images where `image` is None), the number of Gaussians to begin with, a RegionMap
             or None, and the seed, as :func:`kcgs.fitting.initial_field` takes them. It returns a GaussianField with
-            this batch size, without opacities, and with region ids if there is a map. None: the recipe's initializer.
+            this batch size, and with region ids if there is a map. None: the recipe's initializer.
         densify: an event of your own that adds Gaussians: an object with ``act(state)``, called before every step, and
             ``end``, the share of the fit at its last addition. None: matching pursuit.
         optimizer: a name of :class:`FitConfig`, or a function from a field to an optimizer with the members of

@@ -23,7 +23,7 @@ def rank_gaussians(field: GaussianField, regions: RegionMap | Tensor | None = No
     removal raises the squared error least. Gaussians that are removed later come earlier; unused rows come last.
 
     Args:
-        field: N Gaussians of an image, or of each image of a batch, without opacities.
+        field: N Gaussians of an image, or of each image of a batch.
         regions: as in :func:`lowest_impact`.
         backend: as in :func:`lowest_impact`.
 

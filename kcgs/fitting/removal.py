@@ -52,6 +52,8 @@ def lowest_impact(
         (5, torch.Size([20, 3]))
     """
     gaussians, renderer = check_gaussians(field, regions, backend)
+    if field.opacities is not None:
+        raise InvalidArgument("field", "without opacities: call field.without_opacities()", "opacities")
     count = check_count("num_gaussians", num_gaussians, 0, field.num_gaussians)
     return lowest_weighted_impact(renderer, gaussians, count, torch.ones_like(gaussians.means[..., 0]))
 
@@ -59,11 +61,9 @@ def lowest_impact(
 def check_gaussians(
     field: GaussianField, regions: RegionMap | Tensor | None, backend: str
 ) -> tuple[Gaussians, Renderer]:
-    """Return the Gaussians of a field without opacities, and a renderer with the map that confines them."""
+    """Return the Gaussians of a field, and a renderer with the map that confines them."""
     if not isinstance(field, GaussianField):
         raise InvalidArgumentType("field", "a GaussianField", type(field).__name__)
-    if field.opacities is not None:
-        raise InvalidArgument("field", "without opacities", "a field with opacities")
     map_of_field = regions_of(field.size, regions, field.num_images)
     if (map_of_field is None) != (field.region_ids is None):
         raise InvalidArgument("regions", "given where the field has region ids, and only there", regions)

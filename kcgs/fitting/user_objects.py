@@ -80,21 +80,19 @@ def split_names(**arguments: object) -> tuple[dict[str, Any], UserObjects]:
 
 
 def check_initial(field: object, images: Tensor, num_gaussians: int, regions: RegionMap | None) -> GaussianField:
-    """Validate an initializer's field: `num_gaussians` Gaussians without opacities for each of the images."""
+    """Validate an initializer's field, `num_gaussians` Gaussians for each image; return it without opacities."""
     batch, channels, *size = images.shape
-    expected = _layout((batch, num_gaussians, channels), tuple(size), regions is not None, False)
+    expected = _layout((batch, num_gaussians, channels), tuple(size), regions is not None)
     received = type(field).__name__
     if isinstance(field, GaussianField):
-        has_ids, has_opacities = field.region_ids is not None, field.opacities is not None
-        received = _layout(tuple(field.colors.shape), field.size, has_ids, has_opacities)
+        received = _layout(tuple(field.colors.shape), field.size, field.region_ids is not None)
         if received == expected:
-            return field
+            return field.without_opacities()
     raise InvalidArgument("initializer", f"a function that returns a GaussianField of {expected}", received)
 
 
-def _layout(colors: tuple[int, ...], size: tuple[int, ...], has_ids: bool, has_opacities: bool) -> str:
-    ids, opacities = ("" if has else "no " for has in (has_ids, has_opacities))
-    return f"colors {colors}, size {size}, {ids}region_ids and {opacities}opacities"
+def _layout(colors: tuple[int, ...], size: tuple[int, ...], has_ids: bool) -> str:
+    return f"colors {colors}, size {size} and {'' if has_ids else 'no '}region_ids"
 
 
 def check_optimizer(optimizer: FieldOptimizer, num_images: int) -> FieldOptimizer:

@@ -40,8 +40,9 @@ class GaussianField(nn.Module):
         cholesky: factors (l11, l21, l22) in pixels, l11, l22 > 0, :math:`(N, 3)` or :math:`(B, N, 3)`.
         colors: any range, :math:`(N, C)` or :math:`(B, N, C)`.
         region_ids: integer, non-negative, :math:`(N)` or :math:`(B, N)`; None: not confined.
-        opacities: the paper's alpha, :math:`(N)` or :math:`(B, N)`, multiplied into the colours when rendered; None:
-            already multiplied.
+        opacities: the paper's alpha, :math:`(N)` or :math:`(B, N)`; None: already multiplied into the colours. A field,
+            edits and .safetensors files keep them beside the colours; renders, fits, shards and .kcgs files multiply
+            them into the colours.
         size: (height, width) of the image that the pixel units refer to.
 
     Raises:
@@ -221,9 +222,9 @@ class GaussianField(nn.Module):
         for field in fields:
             if not isinstance(field, GaussianField):
                 raise InvalidArgumentType("fields", "GaussianFields", type(field).__name__)
-            if field.num_images is not None or _describe(field) != _describe(fields[0]):
-                expected = f"of one image each and alike, the first with {_describe(fields[0])}"
-                raise InvalidArgument("fields", expected, f"one with {_describe(field)}")
+            if field.num_images is not None or field.extra_repr() != fields[0].extra_repr():
+                expected = f"of one image each and alike, the first with {fields[0].extra_repr()}"
+                raise InvalidArgument("fields", expected, f"one with {field.extra_repr()}")
         if not fields:
             raise InvalidArgument("fields", "at least one", "none", verb="hold")
         columns = ([getattr(field, name) for field in fields] for name in _TABLES)
@@ -271,9 +272,7 @@ class GaussianField(nn.Module):
         return cls(*from_tokens(tokens, size), region_ids, size=size)
 
     def hflip(self) -> GaussianField:
-        """Return the field of the image that is flipped left to right, exactly, with the graph.
-
-        A label map is flipped by ``labels.flip(-1)``.
+        """Return the field flipped left to right, exactly, with the graph; flip a label map by ``labels.flip(-1)``.
 
         Example:
             >>> from kcgs import Scene
@@ -304,6 +303,13 @@ class GaussianField(nn.Module):
     def merged_colors(self) -> Tensor:
         """Return the colours with the opacities multiplied in, (N, C) or (B, N, C)."""
         return self.colors if self.opacities is None else self.colors * self.opacities[..., None]
+
+    def without_opacities(self) -> GaussianField:
+        """Return the field itself; with opacities, a copy of parameters with merged colours, without the graph."""
+        if self.opacities is None:
+            return self
+        means, cholesky, colors = self.means.detach(), self.cholesky.detach(), self.merged_colors().detach()
+        return GaussianField(means, cholesky, colors, self.region_ids, size=self.size)
 
     def get_extra_state(self) -> dict[str, tuple[int, int]]:
         """Return the size, for `state_dict`."""
@@ -338,10 +344,7 @@ class GaussianField(nn.Module):
 
     def extra_repr(self) -> str:
         """Show the numbers that matter."""
-        confined = "confined" if self.region_ids is not None else "not confined"
         images = "" if self.num_images is None else f"{self.num_images} x "
+        confined = "not confined" if self.region_ids is None else "confined"
+        confined += "" if self.opacities is None else ", with opacities"
         return f"{images}{self.num_gaussians} Gaussians, {self.colors.shape[-1]} channels, size={self.size}, {confined}"
-
-
-def _describe(field: GaussianField) -> str:
-    return f"{field.extra_repr()}, {'no ' if field.opacities is None else ''}opacities"

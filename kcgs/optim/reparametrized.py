@@ -60,7 +60,7 @@ class ReparametrizedOptimizer(ABC):
         self, field: GaussianField, rates: Sequence[float], make: Callable[[list[dict[str, Any]]], Optimizer]
     ) -> None:
         if field.opacities is not None:
-            raise InvalidArgument("field", "without opacities", "a field with opacities")
+            raise InvalidArgument("field", "without opacities: call field.without_opacities()", "opacities")
         self.field, self.rates, self.make = field, rates, make
         self.frozen: Tensor | None = None  # [..., N, 1]
         self._set(self.encode(field))

@@ -296,7 +296,7 @@ class TestShards:
             scene, alone = dataset[index], load(f"alone/{stem}.safetensors")
             assert torch.equal(scene.field.means, alone.field.means[rank_gaussians(alone.field)])
             assert float(rows()[stem]["psnr"]) == float(dataset.psnr[index])
-        assert dataset.__getitems__([0, 2]).means.shape == (2, 12, 2)
+        assert dataset.batch([0, 2]).means.shape == (2, 12, 2)
 
     def test_goes_on(self, fit_many: Kcgs, monkeypatch: pytest.MonkeyPatch) -> None:
         """An interrupted command loses one batch; a complete one does nothing."""

@@ -84,7 +84,7 @@ def test_batches_of_shards_with_ids_of_other_types(largest: tuple[int, int], tmp
         scenes = Scene(scenes_of(2).field.assign_regions(labels), labels)
         save_shard(tmp_path / f"0000{number}.safetensors", scenes, "ab", [20.0, 21.0])
     dataset = SceneDataset(tmp_path)
-    batch = dataset.__getitems__([3, 0])
+    batch = dataset.batch([3, 0])
     assert batch.region_ids.amax(1).tolist() == [largest[1], largest[0]] and batch.region_ids.dtype == torch.int64
     assert dataset[3].field.region_ids.unique().tolist() == [0, largest[1]]
 
@@ -168,12 +168,14 @@ def test_indices_and_devices(tmp_path: Path) -> None:
     write(tmp_path)
     dataset = SceneDataset(tmp_path)
     assert repr(dataset) == "SceneDataset(5 scenes in 2 shards, 9 rows, 3 channels, no regions)"
-    batch = dataset.__getitems__([-1, 2]).to("cpu")
+    batch = dataset.batch([-1, 2]).to("cpu")
     assert batch.positions.tolist() == [4, 2] and batch.region_ids is None
     with pytest.raises(TypeError):
         dataset[1:3]  # type: ignore[index]
     with pytest.raises(IndexError):
-        dataset.__getitems__([7])
+        dataset.batch([7])
+    with pytest.raises(ValueError, match="indices must hold at least one; got none"):
+        dataset.batch([])
 
 
 def test_opacities_are_merged_into_the_colors(tmp_path: Path) -> None:

@@ -37,3 +37,10 @@ def test_a_batch_is_as_each_image_alone(has_maps: bool) -> None:
     for k in range(4):
         alone = rank_gaussians(field[k], maps[k] if has_maps else None)
         assert torch.equal(order[k], alone) and sorted(alone.tolist()) == list(range(20))
+
+
+def test_opacities_count() -> None:
+    field = GaussianField.random(20, (16, 24), seed=0)
+    alpha = torch.linspace(0.1, 1.0, 20)
+    faint = GaussianField(field.means, field.cholesky, field.colors, opacities=alpha, size=field.size)
+    assert torch.equal(rank_gaussians(faint), rank_gaussians(faint.without_opacities()))
