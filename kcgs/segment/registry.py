@@ -18,6 +18,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 class _Method(NamedTuple):
     function: Callable[..., Any]
     cleanup: Cleanup
+    takes_cleanup: bool
 
 
 _methods: dict[str, _Method] = {}
@@ -77,12 +78,12 @@ def segment_with_scores(image: Any, method: str = "auto", **options: Any) -> Seg
     for option, default in defaults.items():
         if default is inspect.Parameter.empty and option not in options:
             raise InvalidArgumentType(option, f"given for the method {method!r}", "none")
-    function, cleanup = _methods[method]
+    function, cleanup, takes_cleanup = _methods[method]
     cleanup = replace(cleanup, **{name: options.pop(name) for name in asdict(cleanup) if name in options})
     pixels = check_segment_image(image)
-    cleanup = replace(cleanup, min_size=cleanup.min_pixels(pixels[0].numel()))
-    shared = {key: value for key, value in asdict(cleanup).items() if key in inspect.signature(function).parameters}
-    return cleanup.apply(pixels, function(pixels, **options, **shared))
+    if takes_cleanup:
+        options["cleanup"] = cleanup
+    return cleanup.apply(pixels, function(pixels, **options))
 
 
 def available_methods() -> list[str]:
@@ -102,23 +103,25 @@ def method_options(method: str) -> dict[str, Any]:
     """
     if method not in _methods:
         raise InvalidArgument("method", f"one of {', '.join(available_methods())}", repr(method))
-    function, cleanup = _methods[method]
+    function, cleanup, _ = _methods[method]
     _, *parameters = inspect.signature(function).parameters.values()
     shared = asdict(cleanup)
-    return {option.name: option.default for option in parameters if option.name not in shared} | shared
+    return {option.name: option.default for option in parameters if option.name not in {"cleanup", *shared}} | shared
 
 
-def register(name: str, cleanup: Cleanup | None = None) -> Callable[[Function], Function]:
+def register(
+    name: str, cleanup: Cleanup | None = None, *, takes_cleanup: bool = False
+) -> Callable[[Function], Function]:
     """Make a function a segmentation method.
 
     The function gets the image, a checked tensor :math:`(3, H, W)` float32 in [0, 1], and the options of its keyword
     parameters. It returns labels :math:`(H, W)`, integer or bool, a tensor or a numpy array; or a `Prediction` with
-    scores and names. A parameter with the name of a clean-up option gets the value of the clean-up, ``min_size`` in
-    pixels. Optional libraries are imported inside the function.
+    scores and names. Optional libraries are imported inside the function.
 
     Args:
         name: a new name for `segment`.
         cleanup: the method's defaults of the clean-up options; None: those of `Cleanup`.
+        takes_cleanup: whether the function also gets the `Cleanup` of its labels, as the keyword ``cleanup``.
 
     Returns:
         A decorator that returns the function.
@@ -139,7 +142,7 @@ def register(name: str, cleanup: Cleanup | None = None) -> Callable[[Function], 
         raise InvalidArgument("name", f"a new name, not empty, none of {', '.join(available_methods())}", repr(name))
 
     def add(function: Function) -> Function:
-        _methods[name] = _Method(function, cleanup or Cleanup())
+        _methods[name] = _Method(function, cleanup or Cleanup(), takes_cleanup)
         return function
 
     return add

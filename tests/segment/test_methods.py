@@ -11,7 +11,15 @@ from torch import Tensor
 
 from kcgs.data import chart_2x3, save_labels
 from kcgs.errors import InvalidArgument, InvalidArgumentType
-from kcgs.segment import Prediction, available_methods, method_options, register, segment, segment_with_scores
+from kcgs.segment import (
+    Cleanup,
+    Prediction,
+    available_methods,
+    method_options,
+    register,
+    segment,
+    segment_with_scores,
+)
 from kcgs.segment.methods import auto
 from kcgs.segment.methods import objects as networks
 from kcgs.segment.registry import _methods
@@ -91,17 +99,18 @@ class TestRegistry:
         assert {*METHODS, "dino", "file", "grabcut", "lseg", "onnx", "sam", "text"} <= set(available_methods())
         assert method_options("slic")["n_segments"] == 400
 
-    def test_a_function_gets_the_image_and_the_values_of_its_cleanup(self) -> None:
+    def test_a_function_gets_the_image_and_its_cleanup(self) -> None:
         calls = []
 
-        @register("test")
-        def halves(image: Tensor, *, power: float = 1.0, min_size: int) -> Prediction:
-            calls.append((image.dtype, tuple(image.shape), power, min_size))
+        @register("test", Cleanup(snap=1), takes_cleanup=True)
+        def halves(image: Tensor, *, power: float = 1.0, cleanup: Cleanup) -> Prediction:
+            calls.append((image.dtype, tuple(image.shape), power, cleanup))
             labels = np.broadcast_to(np.arange(30) >= 10, (20, 30))
             return Prediction(labels, labels * 0.5 + 0.25, ["sky", "dog"])
 
-        result = segment_with_scores(torch.zeros(1, 20, 30), "test", power=2.0)
-        assert calls == [(torch.float32, (3, 20, 30), 2.0, 24)]
+        result = segment_with_scores(torch.zeros(1, 20, 30), "test", power=2.0, snap=0)
+        assert calls == [(torch.float32, (3, 20, 30), 2.0, Cleanup())]
+        assert next(iter(method_options("test"))) == "power" and "cleanup" not in method_options("test")
         assert result.scores is not None and result.scores.tolist() == [0.75, 0.25]
         assert result.names == {0: "dog", 1: "sky"}
 

@@ -35,9 +35,9 @@ _MAX_PIXELS = 500_000
 _LARGE = 2 * 1920 * 1080
 
 
-@register("auto", Cleanup(max_regions=30))
+@register("auto", Cleanup(max_regions=30), takes_cleanup=True)
 @image_threads_for_kernels
-def auto(image: Tensor, *, objects: Any = None, snap: int, min_size: int, max_regions: int | None) -> Prediction:
+def auto(image: Tensor, *, objects: Any = None, cleanup: Cleanup) -> Prediction:
     """Segment a photo into up to 30 clean connected regions, or fewer if contours would save too little error.
 
     This is the method of Felzenszwalb and Huttenlocher. Its scale is halved up to twice, while it gives fewer than 4
@@ -57,9 +57,7 @@ def auto(image: Tensor, *, objects: Any = None, snap: int, min_size: int, max_re
         objects: a label map of the image's size, as :func:`kcgs.fit` takes it, whose ids are the names; or "object":
             the main object, found by the method "object"; None: areas of similar colour only. Pieces of objects under
             ``min_size`` join their surroundings.
-        snap: of the clean-up; 0 with objects.
-        min_size: of the clean-up, in pixels.
-        max_regions: of the clean-up.
+        cleanup: its ``min_size`` and ``max_regions`` hold here, too; its ``snap`` must be 0 with objects.
 
     Raises:
         TypeError, ValueError: ``objects`` is no label map of the image's size, or in more pieces than ``max_regions``;
@@ -74,10 +72,11 @@ def auto(image: Tensor, *, objects: Any = None, snap: int, min_size: int, max_re
         ([0, 1], 1)
     """
     image = image.cpu()
+    min_size, max_regions = cleanup.min_pixels(image[0].numel()), cleanup.max_regions
     if objects is None:
         return Prediction(_divide(image, None, min_size, max_regions))
-    if snap:
-        raise InvalidArgument("snap", "0 with objects, whose contours stay", snap)
+    if cleanup.snap:
+        raise InvalidArgument("snap", "0 with objects, whose contours stay", cleanup.snap)
     owners, names = _find_objects(image, objects, min_size)
     pieces = int(connect(owners).max()) + 1
     if max_regions is not None and pieces > max_regions:

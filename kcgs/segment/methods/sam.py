@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kcgs._check import check_count, check_number
 from kcgs.errors import InvalidArgument
-from kcgs.segment.cleanup import Prediction, merge_small
+from kcgs.segment.cleanup import Cleanup, Prediction, merge_small
 from kcgs.segment.cutting import NAMES
 from kcgs.segment.networks import load_pretrained, preprocess
 from kcgs.segment.prompts import Points, Prompt, check_prompt
@@ -24,7 +24,7 @@ _STABILITY_OFFSET = 1.0
 _MAX_OVERLAP = 0.7
 
 
-@register("sam")
+@register("sam", takes_cleanup=True)
 def sam(
     image: Tensor,
     *,
@@ -34,7 +34,7 @@ def sam(
     background: Points | None = None,
     grid: int = 16,
     min_score: float = 0.88,
-    min_size: int,
+    cleanup: Cleanup,
 ) -> Prediction:
     """Segment by Segment Anything (Kirillov et al., ICCV 2023) or SAM 2 (Ravi et al., ICLR 2025).
 
@@ -54,11 +54,11 @@ def sam(
         background: :math:`(P, 2)` points (x, y) that are not of the object.
         grid: number of points along each side, without a prompt, at least 1.
         min_score: least overlap, in [0, 1], that the model predicts for a mask of the grid.
-        min_size: of the clean-up, in pixels; 1 keeps all pieces of an object.
+        cleanup: with a prompt, the object needs a piece of at least its ``min_size``; 1 keeps all pieces.
 
     Raises:
         ValueError: an argument has another shape or is out of its range, the weights do not fit the model, or the
-            object of a prompt has no piece of ``min_size`` pixels.
+            object of a prompt has no such piece.
 
     Example:
         ``segment(image, "sam", box=(30, 40, 200, 180), background=[(60, 70)])``
@@ -93,6 +93,7 @@ def sam(
         pixel_scores[inside] = scores[mask]
     if is_grid:
         return Prediction(labels, pixel_scores)
+    min_size = cleanup.min_pixels(labels.numel())
     if not merge_small(labels.cpu().numpy(), min_size).any():
         raise InvalidArgument("min_size", f"smaller than the object, {int(labels.sum())} pixels in all", min_size)
     return Prediction(labels, pixel_scores, NAMES)

@@ -36,21 +36,21 @@ class _Segmenter:
 
     @property
     def __signature__(self) -> inspect.Signature:
-        signature = inspect.signature(self._function)
-        max_regions = inspect.Parameter("max_regions", inspect.Parameter.KEYWORD_ONLY)
-        return signature.replace(parameters=[*signature.parameters.values(), max_regions])
+        return inspect.signature(self._function)
 
-    def __call__(self, image: Tensor, *, max_regions: int | None, **options: Any) -> Tensor:
-        """Return the segments, after the most similar neighbours have merged to ``max_regions``."""
+    def __call__(self, image: Tensor, *, cleanup: Cleanup, **options: Any) -> Tensor:
+        """Return the segments, after the most similar neighbours have merged to ``max_regions`` of the clean-up."""
         defaults = inspect.signature(self._function).parameters
         for name, value in options.items():
             if type(defaults[name].default) is int:
                 check_count(name, value, least=0)
             elif type(defaults[name].default) is float:
                 check_number(name, value, 0)
+        if "min_size" in defaults:  # felzenszwalb's own option of this name
+            options["min_size"] = cleanup.min_pixels(image[0].numel())
         with library_errors(f"{self.name} of scikit-image fails with {options}"):
             regions = connect(np.asarray(self._function(self.convert(image), **options), dtype=np.int64))
-        return torch.from_numpy(merge_similar(image, regions, max_regions))
+        return torch.from_numpy(merge_similar(image, regions, cleanup.max_regions))
 
 
 def _to_lightness(image: Tensor) -> NDArray[np.float64]:
@@ -63,11 +63,13 @@ def _edge_strength(image: Tensor) -> NDArray[np.float64]:
     return np.asarray(sobel(_to_lightness(image)), dtype=np.float64)
 
 
+def _add(name: str, convert: Callable[[Tensor], NDArray[Any]], cleanup: Cleanup | None = None, **defaults: Any) -> None:
+    register(name, cleanup, takes_cleanup=True)(_Segmenter(name, convert, **defaults))
+
+
 # Lab over 100 has about the range of RGB in [0, 1], for which the usual scales are known.
-register("felzenszwalb")(_Segmenter("felzenszwalb", lambda image: rgb_to_lab(image) / 100, scale=300.0, sigma=1.0))
-register("slic", _SUPERPIXELS)(_Segmenter("slic", to_pixels, n_segments=400, sigma=0.0))
-register("quickshift", _SUPERPIXELS)(
-    _Segmenter("quickshift", to_pixels, kernel_size=3, max_dist=20.0, ratio=0.5, sigma=0.0)
-)
-register("watershed", _SUPERPIXELS)(_Segmenter("watershed", _edge_strength, markers=400, compactness=0.001))
-register("chan_vese")(_Segmenter("chan_vese", _to_lightness))
+_add("felzenszwalb", lambda image: rgb_to_lab(image) / 100, scale=300.0, sigma=1.0)
+_add("slic", to_pixels, _SUPERPIXELS, n_segments=400, sigma=0.0)
+_add("quickshift", to_pixels, _SUPERPIXELS, kernel_size=3, max_dist=20.0, ratio=0.5, sigma=0.0)
+_add("watershed", _edge_strength, _SUPERPIXELS, markers=400, compactness=0.001)
+_add("chan_vese", _to_lightness)
