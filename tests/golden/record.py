@@ -9,6 +9,7 @@ A digest is the first 16 digits of a SHA-256. Bits depend on the processor and o
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import json
 import platform
@@ -93,10 +94,13 @@ def write(names: list[str], digests: dict[str, dict[str, str]]) -> None:
 
 def main(*arguments: str) -> int:
     """Run the command; return the exit status."""
-    prefixes = tuple(argument for argument in arguments if argument != "--check") or ("",)
-    names = [name for name in CASES if name.startswith(prefixes)]
+    parser = argparse.ArgumentParser("python -m tests.golden.record")
+    parser.add_argument("prefixes", nargs="*", default=[""], metavar="PREFIX", help="of names of cases; default: all")
+    parser.add_argument("--check", action="store_true", help="write nothing; name the values that differ")
+    options = parser.parse_args(arguments)
+    names = [name for name in CASES if name.startswith(tuple(options.prefixes))]
     digests = json.loads(EXPECTED.read_text())["digests"]
-    if "--check" not in arguments:
+    if not options.check:
         write(names, digests)
         return 0
     changes = {name: values for name in names if (values := differences(name, digests.get(name, {})))}
