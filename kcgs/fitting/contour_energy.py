@@ -15,6 +15,7 @@ from kcgs.scene import Scene
 from .contour_loops import (
     NOT_COUNTED,
     CostTable,
+    MapEnergy,
     SweepState,
     find_small_pieces,
     map_energy_change,
@@ -113,7 +114,7 @@ class MovingLabels:
         self._smallest, self._pad, self._stride = smallest, pad, padded.shape[1]
         self._sides = disc(1, self._stride)[1:]
         # a pair of neighbours that differ counts an eighth for each of its two pixels
-        self._energy_of = self._labels, costs, length_weight / 4, disc(2, self._stride)
+        self._energy = MapEnergy(self._labels, costs, length_weight / 4, disc(2, self._stride))
         self._areas = np.bincount(index.ravel())
         self._floor = np.minimum(self._areas, smallest)
         self._free = self._labels >= 0
@@ -146,9 +147,7 @@ class MovingLabels:
     def sweep(self, reach: int) -> bool:
         """Give every free pixel near a contour its best label; True if a pixel changed."""
         neighborhood = disc(reach, self._stride)
-        return bool(
-            sweep_pixels(*self._energy_of, self._limit, self._free, self._list_edges(), neighborhood, self._sweeps)
-        )
+        return bool(sweep_pixels(self._energy, self._limit, self._free, self._list_edges(), neighborhood, self._sweeps))
 
     def _list_edges(self) -> Ints:
         """List, in order, the pixels whose label differs from that of the pixel to the right or below."""
@@ -186,13 +185,13 @@ class MovingLabels:
         if was_small or areas[present] - len(piece) < self._floor[present]:
             return present
         targets = set(self._labels[piece[:, None] + self._sides].ravel().tolist()) - {present, -1}
-        energies = {label: piece_energy(*self._energy_of, self._limit, piece, label) for label in sorted(targets)}
+        energies = {label: piece_energy(self._energy, self._limit, piece, label) for label in sorted(targets)}
         best = min(energies, key=lambda label: energies[label], default=present)
         return best if energies.get(best, math.inf) < math.inf else present
 
     def energy_change(self) -> float:
         """Return the energy of the map minus its energy before all moves."""
-        return float(map_energy_change(self._before, *self._energy_of))
+        return float(map_energy_change(self._before, self._energy))
 
 
 def _grow(mask: Mask) -> Mask:

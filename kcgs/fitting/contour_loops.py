@@ -39,6 +39,15 @@ class CostTable(NamedTuple):
     stride: int  # pixels per row of the map
 
 
+class MapEnergy(NamedTuple):
+    """The energy of a label map, which is flat and has a rim of -1."""
+
+    labels: Any  # int32, changes
+    costs: CostTable
+    pair_cost: float  # of two neighbours with different labels
+    disc: Any  # offsets of the pixels within two pixels, the nearest first
+
+
 @inner
 def _cost(costs, pixel, region):
     top, bottom, left, right = costs.boxes[region]
@@ -64,13 +73,13 @@ def _allows(limit, pixel, label):
 
 
 @program.entry
-def sweep_pixels(labels, costs, pair_cost, disc, limit, free, edges, neighborhood, state):
+def sweep_pixels(energy, limit, free, edges, neighborhood, state):
     """Give every free pixel the best label of its neighborhood; True if a pixel changed.
 
-    The map is flat and has a rim of -1. `edges` are the pixels whose label differs from that of the pixel to the right
-    or below. Candidate labels are those before the sweep. Pixels without a change nearby since their last visit are
-    skipped: they would keep their labels.
+    `edges` are the pixels whose label differs from that of the pixel to the right or below. Candidate labels are those
+    before the sweep. Pixels without a change nearby since their last visit are skipped: they would keep their labels.
     """
+    labels, costs, pair_cost, disc = energy  # once: inner functions take 15 % longer with the tuple
     before, changed = labels.copy(), False
     pixels, parities = _list_near_contours(labels, free, edges, costs.stride, neighborhood)
     for parity in range(4):  # neighbours differ in parity
@@ -84,9 +93,9 @@ def sweep_pixels(labels, costs, pair_cost, disc, limit, free, edges, neighborhoo
                 label = before[pixel + neighborhood[place]]
                 if label == present or label == -1 or _has(before, pixel, neighborhood[:place], label):
                     continue
-                energy = _curved_energy(labels, state, costs, pair_cost, disc, pixel, label)
-                if energy < least and _allows(limit, pixel, label):
-                    best, least = label, energy
+                value = _curved_energy(labels, state, costs, pair_cost, disc, pixel, label)
+                if value < least and _allows(limit, pixel, label):
+                    best, least = label, value
             if best != present:
                 changed = True
                 _change(labels, state, disc, neighborhood, pixel, best)
@@ -174,8 +183,9 @@ def _count_excess(labels, disc, pixel):
 
 
 @program.entry
-def piece_energy(labels, costs, pair_cost, disc, limit, piece, label):
+def piece_energy(energy, limit, piece, label):
     """Return the energy of a piece with a label, up to a constant, without curvature; inf if it may not have it."""
+    labels, costs, pair_cost, disc = energy
     total = 0.0
     for pixel in piece:
         total += _energy(labels, costs, pair_cost, disc, pixel, label) if _allows(limit, pixel, label) else math.inf
@@ -183,8 +193,9 @@ def piece_energy(labels, costs, pair_cost, disc, limit, piece, label):
 
 
 @program.entry
-def map_energy_change(before, after, costs, pair_cost, disc):
-    """Return the energy of `after` minus that of `before`; both are flat maps with a rim of -1."""
+def map_energy_change(before, energy):
+    """Return the energy of a map minus its energy with the labels `before`."""
+    after, costs, pair_cost, disc = energy
     change, is_counted = 0.0, np.zeros(len(after), np.bool_)
     for pixel in range(len(after)):
         if after[pixel] == before[pixel]:

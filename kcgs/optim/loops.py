@@ -80,17 +80,18 @@ def is_within(tables, limit):
 
 
 @program.entry
-def step_geometry(means, cholesky, means_gradient, cholesky_gradient, moves, adam, bounds, tasks, counters):
+def step_geometry(tables, gradients, moves, adam, bounds, tasks, counters):
     """Move means [N, 2] and factors [N, 3]; `moves` says which of the two is not frozen. Tasks are ranges of rows."""
     k = first_task(tasks, counters)
     while k >= 0:
-        rows = tasks[k, 1], tasks[k, 2]
-        _step_geometry(means, cholesky, means_gradient, cholesky_gradient, moves, adam, bounds, rows)
+        _step_geometry(tables, gradients, moves, adam, bounds, (tasks[k, 1], tasks[k, 2]))
         k = next_task(tasks, counters, k)
 
 
 @inner
-def _step_geometry(means, cholesky, means_gradient, cholesky_gradient, moves, adam, bounds, rows):
+def _step_geometry(tables, gradients, moves, adam, bounds, rows):
+    means, cholesky = tables
+    means_gradient, cholesky_gradient = gradients
     begin, end = rows
     steps = np.empty((end - begin, 5), np.float32)
     # frame.local_gradient

@@ -15,7 +15,7 @@ from torch import Tensor
 from kcgs import GaussianField, RegionMap, Scene, fit
 from kcgs.data import load_image, load_labels
 from kcgs.fitting.contour_energy import bounding_boxes, disc, index_map, region_costs
-from kcgs.fitting.contour_loops import piece_energy
+from kcgs.fitting.contour_loops import MapEnergy, piece_energy
 from kcgs.fitting.contour_moves import refine_contours
 from kcgs.functional import edge_band, psnr, region_splat
 
@@ -88,8 +88,8 @@ def contour_energy(scene: Scene, image: Tensor, length_weight: float = 0.003, bl
         costs = region_costs(scene, image, boxes, 1, blur, "auto")
     labels, none = np.pad(index, 1, constant_values=-1), np.zeros(0, np.int32)
     # each of eight neighbours of the same label saves half a pair
-    settings = labels.ravel(), costs, length_weight / 8, disc(2, labels.shape[1]), (none, none)
-    energies = [piece_energy(*settings, np.flatnonzero(labels == r), r) for r in range(regions.num_regions)]
+    energy, limit = MapEnergy(labels.ravel(), costs, length_weight / 8, disc(2, labels.shape[1])), (none, none)
+    energies = [piece_energy(energy, limit, np.flatnonzero(labels == r), r) for r in range(regions.num_regions)]
     height, width = index.shape
     pairs = 4 * height * width - 3 * (height + width) + 2
     return float(sum(energies)) + length_weight / 4 * pairs + length_weight * 0.3 * curvature(regions.labels)
