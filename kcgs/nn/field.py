@@ -271,7 +271,7 @@ class GaussianField(nn.Module):
         return cls(*from_tokens(tokens, size), region_ids, size=size)
 
     def hflip(self) -> GaussianField:
-        """Return the field of the image flipped left to right, exactly, with the graph; flip a map by `labels.flip(-1)`.
+        """Return the field of the image flipped left to right, exactly, with the graph; `labels.flip(-1)` flips a map.
 
         Example:
             >>> from kcgs import Scene
