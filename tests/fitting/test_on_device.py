@@ -23,7 +23,7 @@ from kcgs.fitting.state import FitState
 from kcgs.fitting.steppers import CudaStepper, EagerStepper
 from kcgs.fitting.steppers.graph import StepGraph
 from kcgs.fitting.steppers.readback import Readback
-from kcgs.functional import PairSoftness, contour_fit
+from kcgs.functional import PairSoftness, contour_windows
 from kcgs.kernels.cuda.capacity import reports
 from kcgs.optim import adam
 from kcgs.optim.gaussians import Gaussians, Renderer
@@ -283,7 +283,7 @@ def test_contours_move_on_a_device_with_few_waits_and_sums_of_one_order(monkeypa
 
     monkeypatch.setattr(contours, "move_contours", move_contours)
     # the windows of widths are summed on a GPU
-    monkeypatch.setattr(contour_fit, "check_image_and_labels", lambda image, labels: (image.double(), labels.cpu()))
+    monkeypatch.setattr(contour_windows, "check_image_and_labels", lambda image, labels: (image.double(), labels.cpu()))
     labels = (torch.arange(40) > 17).long().expand(32, 40).clone()
     labels[20:, 25:] = 5
     painted = (image() + 0.3 * (labels == 1) - 0.2 * (labels == 5)).clamp(0.0, 1.0)
