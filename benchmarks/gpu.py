@@ -144,6 +144,12 @@ def jobs(options: Options) -> list[Job]:
     ]
 
 
+def _milliseconds(actions: Mapping[str, Callable[[], object]], rounds: int, calls: int) -> Row:
+    """Return the milliseconds of one call of each action, from timings of `calls` calls in a row."""
+    times = milliseconds({name: partial(finish, action, calls) for name, action in actions.items()}, rounds)
+    return {name: time / calls for name, time in times.items()}
+
+
 def page(folder: Path, rows: list[Row]) -> Page:
     """Write the report."""
     swept = [row for row in rows if "image_error" in row]
@@ -209,12 +215,6 @@ def _exactness(rows: list[Row]) -> Iterator[str]:
 
 def _scene_name(row: Row) -> str:
     return str(row["image"]).partition(" ")[0]
-
-
-def _milliseconds(actions: Mapping[str, Callable[[], object]], rounds: int, calls: int) -> Row:
-    """Return the milliseconds of one call of each action, from timings of `calls` calls in a row."""
-    times = milliseconds({name: partial(finish, action, calls) for name, action in actions.items()}, rounds)
-    return {name: time / calls for name, time in times.items()}
 
 
 def _span(values: list[float]) -> str:

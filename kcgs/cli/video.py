@@ -112,7 +112,7 @@ def render_batch(
     """Write a batch as a video or a folder of PNGs, or a single time as an image; return the number of images."""
     from kcgs._check import check_number
     from kcgs.data import save_image
-    from kcgs.video import interpolate, write_video
+    from kcgs.video import DEFAULT_FRAME_RATE, interpolate, write_video
 
     if frame is not None:
         options.exclude("--frame", frame_rate=frame_rate)
@@ -122,7 +122,7 @@ def render_batch(
         return 1
     if output.suffix:  # none: a folder
         check_output(output, *VIDEOS)
-    scene_rate = float(scenes.metadata.get("frame_rate", 24))
+    scene_rate = float(scenes.metadata.get("frame_rate", DEFAULT_FRAME_RATE))
     rate = scene_rate if frame_rate is None else check_number("frame_rate", frame_rate, 0.0, 1000.0, above=True)
     count = 1 + math.floor((len(scenes) - 1) * rate / scene_rate + 1e-6)
     times = (min(number * scene_rate / rate, len(scenes) - 1.0) for number in range(count))

@@ -20,7 +20,7 @@ from .splat import region_splat, splat_at
 from .tokens import from_tokens, to_tokens
 from .values import check_values
 
-# public; what else is imported here is for the other rooms of kcgs
+# public; other packages of kcgs use the other imports
 __all__ = [
     "PairSoftness", "activate_gaussians", "cholesky_to_covariance", "cholesky_to_scale_rotation", "choose_softness",
     "covariance_to_cholesky", "edge_band", "ef_psnr", "ef_ssim", "from_tokens", "lookup_regions", "merge_regions",

@@ -8,16 +8,15 @@ from torch import Tensor
 
 from kcgs.maps import MapTable
 
-# positions in the schema of the table's first field, and of the argument after the table
-_TABLE = 4
-_END = _TABLE + len(MapTable._fields)
+# place of the table's first field in the schema
+TABLE_PLACE = 4
 # the operator takes the fields of a table one by one, since operators of torch take no NamedTuple
 SCHEMA = (
     "Tensor means, Tensor cholesky, Tensor colors, Tensor? region_ids, "
     + ", ".join(f"Tensor? {name}" for name in MapTable._fields)
     + ", SymInt height, SymInt width, float cutoff, str backend"
 )
-NUM_ARGUMENTS = _END + 4
+NUM_ARGUMENTS = len(SCHEMA.split(", "))
 
 
 class SplatArguments(NamedTuple):
@@ -38,17 +37,11 @@ class SplatArguments(NamedTuple):
     @classmethod
     def of(cls, *values: Any) -> SplatArguments:
         """Take the arguments in the order of the schema."""
-        table = None if values[_TABLE] is None else MapTable(*values[_TABLE:_END])
-        means, cholesky, colors, region_ids = values[:_TABLE]
-        height, width, cutoff, backend = values[_END:]
+        means, cholesky, colors, region_ids, *fields, height, width, cutoff, backend = values
+        table = None if fields[0] is None else MapTable(*fields)
         return cls(means, cholesky, colors, region_ids, table, (height, width), cutoff, backend)
 
     def flatten(self) -> tuple[Any, ...]:
         """Return the arguments in the order of the schema."""
         table = [None] * len(MapTable._fields) if self.table is None else self.table
-        return (*self[:_TABLE], *table, *self.size, self.cutoff, self.backend)
-
-
-def place_of(name: str) -> int:
-    """Return the place of a field of the table among the arguments."""
-    return _TABLE + MapTable._fields.index(name)
+        return (*self[:TABLE_PLACE], *table, *self.size, self.cutoff, self.backend)

@@ -9,7 +9,8 @@ from kcgs._check import check_number
 from kcgs._labels import check_labels
 from kcgs.errors import InvalidArgument
 
-from .contour_fit import check_image_and_labels, contour_gain
+from .contour_fit import contour_gain
+from .contour_windows import check_image_and_labels
 
 # squared error, mean over channels, that a pixel of contour must save: what Gaussians would save with its bits
 MERGE_COST = 0.003

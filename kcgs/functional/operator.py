@@ -25,7 +25,7 @@ from kcgs._torch_internals import (
 )
 from kcgs.maps import PER_MAP, SHARED, MapTable
 
-from .arguments import NUM_ARGUMENTS, SCHEMA, SplatArguments, place_of
+from .arguments import NUM_ARGUMENTS, SCHEMA, TABLE_PLACE, SplatArguments
 from .evaluation import Evaluation, differentiate, differentiate_forward, differentiate_twice, prepare, render
 
 # number of arguments without a derivative
@@ -269,7 +269,7 @@ def _fold(info: Any, in_dims: tuple[int | None, ...], arguments: tuple[Any, ...]
 
     Returns whether there was a batch, and the arguments.
     """
-    places = {name: first + place_of(name) for name in MapTable._fields}
+    places = {name: k for k, name in enumerate(MapTable._fields, first + TABLE_PLACE)}
     labels = places["labels"]
     if any(in_dims[k] is not None for k in places.values() if k != labels):
         raise ValueError("a RegionMap cannot be mapped over: give the images as a batch")

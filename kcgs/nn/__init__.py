@@ -4,5 +4,5 @@ from .field import GaussianField
 from .renderer import RegionSplatRenderer, area_mean, rendered_size
 from .rows import clear_lost_rows, join, pad_rows, reorder_rows, scaled_gaussians, used_rows
 
-# public; what else is imported here is for the other rooms of kcgs
+# public; other packages of kcgs use the other imports
 __all__ = ["GaussianField", "RegionSplatRenderer"]

@@ -343,7 +343,7 @@ class GaussianField(nn.Module):
         return self
 
     def extra_repr(self) -> str:
-        """Show the numbers that matter."""
+        """Return the numbers of images, Gaussians and channels, the size, and whether there are ids and opacities."""
         images = "" if self.num_images is None else f"{self.num_images} x "
         confined = "not confined" if self.region_ids is None else "confined"
         confined += "" if self.opacities is None else ", with opacities"

@@ -10,5 +10,5 @@ from .registry import OBJECTIVES
 from .reparametrized import ReparametrizedOptimizer
 from .run import End, Event, TimedAction, cosine_decay, count_iterations, run
 
-# public; what else is imported here is for the other rooms of kcgs
+# public; other packages of kcgs use the other imports
 __all__ = ["FieldOptimizer", "GaussianAdam", "ReparametrizedOptimizer"]

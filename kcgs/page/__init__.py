@@ -3,5 +3,5 @@
 from .html import ELEMENT, scene_page, web_bytes
 from .server import serve
 
-# public; what else is imported here is for the other rooms of kcgs
+# public; other packages of kcgs use the other imports
 __all__ = ["ELEMENT", "scene_page"]

@@ -27,7 +27,8 @@ def delete_from_video(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
 
     Convention: a hidden pixel takes colour and label from the nearest frame that shows it. Its place there is computed
     from the motion of the other regions' Gaussians; this motion is assumed to be affine. Pixels that no frame shows
-    continue their surroundings. The rows of the deleted regions are fitted to the filled pixels.
+    continue their surroundings. The rows of the deleted regions are fitted to the filled pixels. In the new scenes no
+    Gaussian is thinner than the default `min_sigma` of a fit, 0.5 pixels.
 
     Args:
         scenes: T frames with label maps, as :func:`fit_video` returns them.
@@ -51,8 +52,7 @@ def delete_from_video(scenes: Scene, region_ids: int | Iterable[int]) -> Scene:
     """
     regions, row_ids, deleted_ids = _check(scenes, region_ids)
     deleted_pixels, deleted_rows = torch.isin(regions.labels, deleted_ids), torch.isin(row_ids, deleted_ids)
-    # scenes do not store the settings of their fit; a descent without moves of contours uses only the objective, the
-    # backend and the cutoff
+    # scenes do not store the settings of their fit: the defaults hold
     config, frames = config_for("video", FitConfig()), list[Scene]()
     with threads_for_kernels(scenes.size[0] * scenes.size[1]):
         motions = affine_motions(scenes.field.means.detach(), ~deleted_rows)

@@ -22,7 +22,7 @@ from kcgs.fitting.problem import make_problem
 from kcgs.fitting.state import FitState
 from kcgs.fitting.stepper import EagerStepper
 from kcgs.fitting.stepper_cuda import CudaStepper, Readback, StepGraph
-from kcgs.functional import PairSoftness, contour_fit
+from kcgs.functional import PairSoftness, contour_windows
 from kcgs.kernels.cuda.capacity import reports
 from kcgs.optim import adam
 from kcgs.optim.gaussians import Gaussians, Renderer
@@ -282,7 +282,7 @@ def test_contours_move_on_a_device_with_few_waits_and_sums_of_one_order(monkeypa
 
     monkeypatch.setattr(contours, "move_contours", move_contours)
     # the windows of widths are summed on a GPU
-    monkeypatch.setattr(contour_fit, "check_image_and_labels", lambda image, labels: (image.double(), labels.cpu()))
+    monkeypatch.setattr(contour_windows, "check_image_and_labels", lambda image, labels: (image.double(), labels.cpu()))
     labels = (torch.arange(40) > 17).long().expand(32, 40).clone()
     labels[20:, 25:] = 5
     painted = (image() + 0.3 * (labels == 1) - 0.2 * (labels == 5)).clamp(0.0, 1.0)

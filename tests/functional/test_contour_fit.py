@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kcgs import RegionMap
 from kcgs.data import chart_2x3, chart_pie, load_image, load_labels
-from kcgs.functional import choose_softness, contour_fit
+from kcgs.functional import choose_softness, contour_fit, contour_windows
 from kcgs.functional.contour_fit import contour_gain
 
 COLORS = torch.tensor([[0.2, 0.3, 0.6], [0.8, 0.6, 0.3]])
@@ -76,7 +76,7 @@ class TestChooseSoftness:
         """It sums windows in float64."""
         image, labels = paint(ellipse(), 1.0) + grain(0.02), ellipse()
         expected = choose_softness(image, labels)
-        monkeypatch.setattr(contour_fit, "check_image_and_labels", lambda image, labels: (image.double(), labels))
+        monkeypatch.setattr(contour_windows, "check_image_and_labels", lambda image, labels: (image.double(), labels))
         assert choose_softness(image, labels) == expected
 
     def test_pairs(self) -> None:
@@ -122,7 +122,7 @@ class TestChooseSoftness:
         assert wide[0, 1] == pytest.approx(5.0, abs=0.5)
 
     def test_long_contours_are_sampled(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(contour_fit, "_PAIR_WINDOWS", 10)
+        monkeypatch.setattr(contour_windows, "_PAIR_WINDOWS", 10)
         assert choose_softness(paint(ellipse(), 1.0), ellipse()) == {(0, 1): pytest.approx(1.0, abs=0.1)}
 
     @pytest.mark.parametrize(("name", "low", "high"), [("dog", 1.2, 1.6), ("blackswan", 0.7, 1.0)])
