@@ -119,7 +119,7 @@ def register(
     scores and names. Optional libraries are imported inside the function.
 
     Args:
-        name: a new name for `segment`.
+        name: a new name for `segment`. The same function, defined once more in a notebook, replaces itself.
         cleanup: the method's defaults of the clean-up options; None: those of `Cleanup`.
         takes_cleanup: whether the function also gets the `Cleanup` of its labels, as the keyword ``cleanup``.
 
@@ -127,7 +127,7 @@ def register(
         A decorator that returns the function.
 
     Raises:
-        ValueError: the name is empty or taken.
+        ValueError: the name is empty or that of another function.
 
     Example:
         >>> import torch
@@ -138,11 +138,18 @@ def register(
         >>> segment(torch.zeros(3, 2, 4), method="halves")[0].tolist()
         [0, 0, 1, 1]
     """
-    if not name or name in _methods:
-        raise InvalidArgument("name", f"a new name, not empty, none of {', '.join(available_methods())}", repr(name))
 
     def add(function: Function) -> Function:
-        _methods[name] = _Method(function, cleanup or Cleanup(), takes_cleanup)
+        method = _Method(function, cleanup or Cleanup(), takes_cleanup)
+        if not name or _place(_methods.get(name, method).function) != _place(function):
+            expected = f"a new name, not empty, none of {', '.join(available_methods())}"
+            raise InvalidArgument("name", expected, repr(name))
+        _methods[name] = method
         return function
 
     return add
+
+
+def _place(function: Callable[..., Any]) -> tuple[str, str]:
+    """Return where a function is defined: its module and its name there."""
+    return function.__module__, getattr(function, "__qualname__", "")

@@ -129,6 +129,11 @@ class TestRegistry:
         with pytest.raises(error, match=message):
             segment(torch.zeros(3, 4, 4), "test")
 
+    def test_a_function_defined_again_replaces_itself(self) -> None:
+        for threshold in (0.5, 2.0):
+            register("test")(lambda image, limit=threshold: (image[0] > limit).long())
+        assert segment(torch.eye(4)[None], "test", connected=False, min_size=1).unique().tolist() == [0]
+
     def test_errors(self) -> None:
         with pytest.raises(InvalidArgument, match="method must be one of auto, .*; got 'magic'"):
             segment(torch.zeros(3, 4, 4), "magic")
@@ -136,7 +141,7 @@ class TestRegistry:
             segment(torch.zeros(3, 4, 4), colour=3)
         for name in ("auto", ""):
             with pytest.raises(InvalidArgument, match="name must be a new name"):
-                register(name)
+                register(name)(lambda image: image[0] > 0.5)
 
 
 class TestAuto:
