@@ -31,7 +31,7 @@ from torch import Tensor
 
 from benchmarks.core.images import load
 from kcgs.codec.labels.contexts import TEMPLATE, layout
-from kcgs.codec.labels.wavefront import advance, new_scan, number_regions
+from kcgs.codec.labels.wavefront import advance, new_scan, order_regions
 from kcgs.data import load_image, load_labels
 from kcgs.segment import segment
 
@@ -68,7 +68,7 @@ def examples(labels: Any) -> tuple[Any, Any]:
     The class is 0 or 1 for the first or the second candidate, 2 for neither.
     """
     ids, index = np.unique(labels, return_inverse=True)
-    truth, seeds, _ = number_regions(index.reshape(labels.shape).astype(np.int32), len(ids))
+    truth, seeds, _ = order_regions(index.reshape(labels.shape).astype(np.int32), len(ids))
     scan = new_scan(seeds, len(ids), is_file=False)
     features, classes = [np.zeros((0, len(TEMPLATE)), np.int8)], [np.zeros(0, np.int64)]
     while count := advance(scan, scan.answers, truth):

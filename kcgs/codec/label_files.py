@@ -62,10 +62,10 @@ def encode_labels(labels: Tensor | NDArray[Any]) -> bytes:
 def _encode_smallest(ids: Integers, index: NDArray[Any]) -> tuple[int, bytes]:
     """Return the turn of a map that takes the fewest bytes of those tried, and its stream."""
     from .labels.stream import encode_stream  # loads numba
-    from .labels.wavefront import number_regions
+    from .labels.wavefront import order_regions
 
     # as a rule, a turn with fewer seeds has a smaller stream
-    seeds = [int(number_regions(turned(index, turn), len(ids))[1].sum()) for turn in range(_TURNS)]
+    seeds = [int(order_regions(turned(index, turn), len(ids))[1].sum()) for turn in range(_TURNS)]
     fewest = sorted(range(_TURNS), key=seeds.__getitem__)[:_TRIED_TURNS]
     turns = [turn for turn in fewest if seeds[turn] <= min(seeds) + _SEED_MARGIN]
     streams = [(turn, encode_stream(ids, turned(index, turn), is_file=True)) for turn in turns]

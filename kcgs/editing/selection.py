@@ -33,9 +33,7 @@ def select_regions(scene: Scene, region_ids: object) -> Selection:
     """Select regions of a scene of one image, which must have a map."""
     regions = check_scene(scene).regions
     if regions is None:
-        raise InvalidArgument(
-            "scene", "a label map", "none: small files drop theirs, unless --keep-contours keeps it", verb="have"
-        )
+        raise InvalidArgument("scene", "a label map", "none: small files have none", verb="have")
     ids = torch.tensor(unique_region_ids(region_ids, regions.ids, "map"), device=regions.ids.device)
     return Selection(regions, ids, torch.isin(regions.labels, ids), members_of(scene.field, ids))
 

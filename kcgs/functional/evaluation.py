@@ -42,7 +42,7 @@ def _refuse(arguments: SplatArguments, inputs: SplatInputs) -> NoReturn:
     """Raise the error of the value for which a kernel returned no plan."""
     check_values(*arguments[:3])
     _check_ids(inputs)
-    raise AssertionError("a kernel refuses values that pass the checks")
+    raise AssertionError("bug: a kernel made no plan for valid inputs")
 
 
 def render(arguments: SplatArguments, evaluation: Evaluation) -> Tensor:

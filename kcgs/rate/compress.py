@@ -198,7 +198,7 @@ class Compressor:
         size, candidates = target_bytes, []
         for _ in range(_MAX_ROUNDINGS):
             qp = min(writer.next_qp(qp, size, round(_ROUNDING_AIM * target_bytes)), max_qp)
-            data = self._round(writer, qp, self.rounding_iterations, target_bytes)
+            data = self._write_gradually(writer, qp, self.rounding_iterations, target_bytes)
             size = len(data)
             if size <= target_bytes:
                 candidates.append(data)
@@ -206,13 +206,13 @@ class Compressor:
                 break
         if candidates:
             return max(candidates, key=len)
-        return writer.largest_file(lambda qp: self._round(writer, qp, 0), target_bytes)[1]
+        return writer.largest_file(lambda qp: self._write_gradually(writer, qp, 0), target_bytes)[1]
 
     def _secant(self, writer: SceneWriter, qp: int, target_bytes: int) -> int:
         """Find, by the secant method, the QP at which a file has about `target_bytes` if it is rounded at once."""
         sizes: dict[int, int] = {}
         while len(sizes) < _MAX_SECANTS and qp not in sizes:
-            sizes[qp] = len(self._round(writer, qp, 0))
+            sizes[qp] = len(self._write_gradually(writer, qp, 0))
             next_qp = writer.next_qp(qp, sizes[qp], target_bytes)
             if len(sizes) > 1:
                 (a, size_a), (b, size_b) = [*sizes.items()][-2:]
@@ -231,7 +231,7 @@ class Compressor:
 
     def write(self, qp: int) -> bytes:
         """Return the file at a QP."""
-        return self._round(self._descend(qp, lambda _, qp: qp)[0], qp, self.rounding_iterations)
+        return self._write_gradually(self._descend(qp, lambda _, qp: qp)[0], qp, self.rounding_iterations)
 
     def _descend(self, qp: int, update_qp: Callable[[SceneWriter, int], int]) -> tuple[SceneWriter, int]:
         """Lower error and bits before rounding; `update_qp` returns the QP for the current scene.
@@ -256,7 +256,7 @@ class Compressor:
         run(descent, descent.step, progress, [End(), TimedAction(times, update)], lambda progress: RATE)
         return writer.with_gaussians(descent.parameters(), descent.ids) if iterations else writer, qp
 
-    def _round(self, writer: SceneWriter, qp: int, iterations: int, max_bytes: float = math.inf) -> bytes:
+    def _write_gradually(self, writer: SceneWriter, qp: int, iterations: int, max_bytes: float = math.inf) -> bytes:
         descent = self._new_descent(writer)
         descent.quantizer = quantizer = Quantizer(qp, writer.size)
         descent.prune()

@@ -23,15 +23,13 @@ from kcgs.optim import Gaussians
 from kcgs.scene import Scene
 
 from .files import DEFAULT_FRAME_RATE
-from .flow import move_labels, move_points, optical_flow
+from .flow import is_cut, move_labels, move_points, optical_flow
 from .frame_descent import FrameDescent, renderer_of
 from .stacking import stack
 
 OnFrame = Callable[[int, Scene], bool | None]
 Labels = RegionMap | Tensor | NDArray[Any]
 
-# a scene cut is where the squared error of the start is above this share of the image's variance
-_CUT_SHARE = 0.5
 # share of the movable rows that is relocated, by iteration of the descent
 _RELOCATIONS = {0: 0.05, 20: 0.05, 40: 0.05, 60: 0.05}
 # A pixel changed if the mean error around it is more than `_MAX_GROWTH` times the mean error after its fit, plus
@@ -161,7 +159,7 @@ class _VideoFit:
             labels = move_labels(flow, before.labels) if regions is None else regions.labels
             regions = first.relabel(labels, "mean")
         start, movable_rows, changed_pixels = self._start(flow, regions)
-        if float(self._squared_error(start).mean()) > _CUT_SHARE * float(self.image.var((1, 2)).mean()):
+        if is_cut(self._squared_error(start), self.image):
             if is_moved and regions is not None:
                 regions = regions.relabel(regions.labels.flatten().mode()[0].expand(regions.size))
             return self._fit_anew(regions), torch.ones_like(changed_pixels)

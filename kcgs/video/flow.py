@@ -11,6 +11,8 @@ from torch.nn.functional import grid_sample, interpolate
 _SIDE = 160
 # half the side of the window in which the flow is constant, in reduced pixels; larger windows are more robust
 _RADIUS = 5
+# a scene cut is where the squared error of the moved frame before is above this share of the image's variance
+_CUT_SHARE = 0.5
 # fixed-point iterations of `move_points`: they converge where offsets change by less than a pixel per pixel
 _ITERATIONS = 5
 
@@ -43,6 +45,19 @@ def sample(planes: Tensor, points: Tensor) -> Tensor:
     grid = points / points.new_tensor([width, height]) * 2 - 1
     values = grid_sample(planes[None], grid[None, None].to(planes), padding_mode="border", align_corners=False)
     return values[0, :, 0].T.to(points)
+
+
+def is_cut(squared_error: Tensor, image: Tensor) -> bool:
+    """Return whether an image (C, H, W) belongs to another shot than the frame before, moved to it with this error."""
+    return float(squared_error.mean()) > _CUT_SHARE * float(image.var((1, 2)).mean())
+
+
+def move_image(flow: Tensor, image: Tensor) -> Tensor:
+    """Return an image (C, H, W) whose pixels are sampled at their places in the previous image."""
+    height, width = image.shape[1:]
+    y, x = torch.meshgrid(torch.arange(height).to(flow), torch.arange(width).to(flow), indexing="ij")
+    points = torch.stack([x + flow[0], y + flow[1]], -1) + 0.5
+    return sample(image, points.flatten(0, 1)).T.reshape(image.shape)
 
 
 def move_points(flow: Tensor, points: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from kcgs.editing import members_of
 from kcgs.nn import GaussianField, join
 from kcgs.scene import Scene, check_batch
 
-from .flow import move_labels, move_points, optical_flow, sample
+from .flow import is_cut, move_image, move_labels, move_points, optical_flow, sample
 
 
 @torch.no_grad()
@@ -27,7 +27,7 @@ def interpolate(scenes: Scene, time: float) -> Scene:
         time: in frames, 0 to T - 1.
 
     Returns:
-        The frame itself for a whole `time`; otherwise a scene of up to 2 N Gaussians.
+        The frame itself for a whole `time`, the nearer frame at a scene cut, otherwise a scene of up to 2 N Gaussians.
 
     Raises:
         TypeError: a scene of one image.
@@ -44,7 +44,10 @@ def interpolate(scenes: Scene, time: float) -> Scene:
     if fraction == 0.0:
         return scenes[number]
     first, second = scenes[number], scenes[number + 1]
-    flow = optical_flow(first.render(), second.render())
+    previous, image = first.render(), second.render()
+    flow = optical_flow(previous, image)
+    if is_cut((move_image(flow, previous) - image).square(), image):
+        return first if fraction < 0.5 else second
     earlier, later = first.field, second.field
     earlier_means = earlier.means.lerp(move_points(flow, earlier.means), fraction)
     later_means = later.means + (1 - fraction) * sample(flow, later.means)

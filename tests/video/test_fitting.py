@@ -137,6 +137,13 @@ class TestInterpolate:
         errors = [(render - image)[:, labels == 7].square().mean() for render in renders]
         assert errors[0] < 0.63 * errors[1]
 
+    @pytest.mark.parametrize("time", [0.4, 0.6])
+    def test_scene_cut(self, time: float) -> None:
+        """No Gaussian of one shot is seen in the other."""
+        other = (torch.arange(SIZE[1]) % 8 < 4).float().expand(3, *SIZE)
+        scenes = fit_video([FRAMES[0], other], None, 40, iterations=30)
+        assert torch.equal(interpolate(scenes, time).render(), scenes[round(time)].render())
+
     def test_whole_time(self, scenes: Scene) -> None:
         assert torch.equal(interpolate(scenes, 3).render(), scenes[3].render())
 

@@ -14,7 +14,7 @@ from kcgs.codec.rangecoder import Reader, Writer
 
 from .ids import code_ids
 from .pixels import WorkLimitError, code_pixels
-from .wavefront import number_regions
+from .wavefront import order_regions
 
 _NOISE_CHANCE = np.array([2.0**-10])  # chance that a map is coded as noise
 _NOISE_OVERHEAD = 64  # bits by which the model's stream may exceed that of noise
@@ -28,7 +28,7 @@ def encode_stream(ids: Integers, index: Any, *, is_file: bool) -> bytes:
 
     `is_file`: the file of a label map; False: the map of a scene, which has other models.
     """
-    truth, seeds, order = number_regions(index, len(ids))
+    truth, seeds, order = order_regions(index, len(ids))
     numbered = ids[order].tolist()
     writer = _start(numbered, is_file, is_noise=False)
     if len(ids) == 1:

@@ -250,7 +250,7 @@ def find_nearest(labels, pixel, nearest):
 
 
 @program.entry
-def number_regions(index, num_regions):
+def order_regions(index, num_regions):
     """Number the regions in the order in which wavefronts reach them, and mark seeds.
 
     Returns the number of each pixel's region, the seeds, and for each number the region's value in `index`.
