@@ -187,11 +187,14 @@ def _is_done(job: FitJob) -> bool:
 
 
 def _existing_row(job: FitJob, fingerprint: str) -> dict[str, Any] | None:
-    """Return the row of an existing, unchanged scene, else None; without --overwrite, refuse to replace another."""
+    """Return the row of an unchanged scene, else None; without --overwrite, refuse to replace a file."""
+    record = job.output.with_suffix(".json")
     if not job.output.is_file():
+        if record.is_file() and "fingerprint" not in _read_row(record) and not job.overwrite:
+            raise FileExistsError(f"{record} exists, and was not written by kcgs fit-many; --overwrite replaces it")
         return None
     row = _valid_row(job, fingerprint)
-    is_unfinished = _read_row(job.output.with_suffix(".json")) == {"fingerprint": fingerprint}
+    is_unfinished = _read_row(record) == {"fingerprint": fingerprint}
     if row is None and not (is_unfinished or job.overwrite):
         problem = "made with other settings or changed since"
         raise FileExistsError(f"{job.output} exists, {problem}; --overwrite replaces it")

@@ -144,7 +144,7 @@ class _VideoFit:
     def _fit_anew(self, regions: RegionMap | None) -> Scene:
         """Fit a frame independently of other frames; some rows may stay unused."""
         config = self.config
-        if self.frames:  # contours have the softness of the first frame
+        if self.frames:  # `stack` gives all contours the softness of the first frame
             config = config.model_copy(update={"softness": 0.0})
         count = check_num_gaussians(self.num_gaussians, self.image)
         scene = fit(self.image, regions, count, recipe=config, seed=self.seed).scene

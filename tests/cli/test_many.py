@@ -90,6 +90,15 @@ class TestTable:
 
 
 class TestResume:
+    def test_a_file_of_the_user_is_kept(self, fit_many: Kcgs) -> None:
+        """It has the name of the row of an image."""
+        Path("out").mkdir()
+        Path("out/a.json").write_text('{"caption": "a cup"}')
+        code, _, err = fit_many("photos/a.png", *SETTINGS)
+        assert code == 1 and "a.json exists, and was not written by kcgs fit-many; --overwrite replaces it\n" in err
+        assert json.loads(Path("out/a.json").read_text()) == {"caption": "a cup"}
+        assert fit_many("photos/a.png", *SETTINGS, "--overwrite").code == 0
+
     def test_scenes_are_kept(self, fit_many: Kcgs) -> None:
         arguments = ("photos/a.png", "photos/b.png", *SETTINGS, "--json")
         assert fit_many(*arguments).code == 0

@@ -8,7 +8,7 @@ import { AdaptiveNumber } from "./adaptive_number.ts";
 
 const MAX_MARGIN = 255;
 const NEAR = 2; // classes of size
-const EVERYWHERE = 480000;
+const EVERYWHERE = 480000; // weight that all cells share before any Gaussian: 64 * 625 * 12
 // of a file: classes of size, cells outside, and those for each Gaussian
 const MAX_CLASSES = 4096;
 const MAX_OUTSIDE = 2 ** 26;
