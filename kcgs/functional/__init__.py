@@ -1,6 +1,6 @@
 """Stateless public operations: splatting, covariances, label maps, metrics."""
 
-from kcgs.maps import PairSoftness, edge_band, lookup_regions
+from kcgs.maps import PairSoftness, RegionMap, edge_band, lookup_regions
 
 from .activation import activate_gaussians
 from .blur import blur, gaussian_taps, halve
@@ -22,7 +22,8 @@ from .values import check_values
 
 # public; other packages of kcgs use the other imports
 __all__ = [
-    "PairSoftness", "activate_gaussians", "cholesky_to_covariance", "cholesky_to_scale_rotation", "choose_softness",
-    "covariance_to_cholesky", "edge_band", "ef_psnr", "ef_ssim", "from_tokens", "lookup_regions", "merge_regions",
-    "ms_ssim", "psnr", "region_splat", "scale_rotation_to_cholesky", "ssim", "ssimulacra2", "to_tokens",
+    "PairSoftness", "RegionMap", "activate_gaussians", "cholesky_to_covariance", "cholesky_to_scale_rotation",
+    "choose_softness", "covariance_to_cholesky", "edge_band", "ef_psnr", "ef_ssim", "from_tokens", "lookup_regions",
+    "merge_regions", "ms_ssim", "psnr", "region_splat", "scale_rotation_to_cholesky", "ssim", "ssimulacra2",
+    "to_tokens",
 ]  # fmt: skip
