@@ -80,7 +80,7 @@ def recolor_region(
         raise ValueError("scene must have region ids; call scene.field.assign_regions(regions)")
     ids = unique_region_ids(region_ids, field.region_ids, "Gaussians")
     if (color is None) == (gain is None and bias is None):
-        raise ValueError("color, or gain and bias, must be given; got both or neither")
+        raise ValueError("color must be given, or gain or bias; got both or neither")
     if color is None:
         if strength is not None:
             raise InvalidArgument("strength", "None without color", strength)

@@ -83,9 +83,9 @@ def _step_geometry(state: dict[str, Tensor], group: dict[str, Any], finite: Tens
 
         moves = means.requires_grad, cholesky.requires_grad
         adam = Adam(*_settings(group), *_averages(state))
-        tables, count = _rows(means, cholesky), means[..., 0].numel()
-        loop = partial(loops.step_geometry, tuple(tables), tuple(_rows(*gradients)), moves, adam, bounds_of(group))
-        run_tasks(loop, ranges(count, _TASK_ROWS), count, _THREAD_ROWS)
+        tables = tuple(_rows(means, cholesky))
+        loop = partial(loops.step_geometry, tables, tuple(_rows(*gradients)), moves, adam, bounds_of(group))
+        run_tasks(loop, ranges(len(tables[0]), _TASK_ROWS), len(tables[0]), _THREAD_ROWS)
         increment_version([parameter for parameter in group["params"] if parameter.requires_grad])
         return
     moving = _moving_rows(state["age"], finite)

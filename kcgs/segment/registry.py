@@ -105,8 +105,11 @@ def method_options(method: str) -> dict[str, Any]:
         raise InvalidArgument("method", f"one of {', '.join(available_methods())}", repr(method))
     function, cleanup, _ = _methods[method]
     _, *parameters = inspect.signature(function).parameters.values()
+    own = {option.name: option.default for option in parameters if option.name != "cleanup"}
     shared = asdict(cleanup)
-    return {option.name: option.default for option in parameters if option.name not in {"cleanup", *shared}} | shared
+    if names := own.keys() & shared.keys():  # not when it is registered: a signature may load a library
+        raise InvalidArgument("function", "without options of the clean-up: see takes_cleanup", sorted(names))
+    return own | shared
 
 
 def register(
@@ -127,7 +130,8 @@ def register(
         A decorator that returns the function.
 
     Raises:
-        ValueError: the name is empty or that of another function.
+        ValueError: the name is empty or that of another function. When the method is used: the function has a parameter
+            with the name of a clean-up option.
 
     Example:
         >>> import torch

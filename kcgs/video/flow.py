@@ -48,16 +48,13 @@ def sample(planes: Tensor, points: Tensor) -> Tensor:
 
 
 def is_cut(squared_error: Tensor, image: Tensor) -> bool:
-    """Return whether an image (C, H, W) belongs to another shot than the frame before, moved to it with this error."""
+    """Return whether an image (C, H, W) begins another shot: the moved frame before has this squared error."""
     return float(squared_error.mean()) > _CUT_SHARE * float(image.var((1, 2)).mean())
 
 
 def move_image(flow: Tensor, image: Tensor) -> Tensor:
     """Return an image (C, H, W) whose pixels are sampled at their places in the previous image."""
-    height, width = image.shape[1:]
-    y, x = torch.meshgrid(torch.arange(height).to(flow), torch.arange(width).to(flow), indexing="ij")
-    points = torch.stack([x + flow[0], y + flow[1]], -1) + 0.5
-    return sample(image, points.flatten(0, 1)).T.reshape(image.shape)
+    return sample(image, _places(flow).flatten(1).T + 0.5).T.reshape(image.shape)
 
 
 def move_points(flow: Tensor, points: Tensor) -> Tensor:
@@ -71,7 +68,11 @@ def move_points(flow: Tensor, points: Tensor) -> Tensor:
 def move_labels(flow: Tensor, labels: Tensor) -> Tensor:
     """Return the labels (H, W) of the image, each read at the pixel's place in the previous image."""
     height, width = labels.shape
-    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    cols = (x.to(flow) + flow[0]).round().long().clamp(0, width - 1)
-    rows = (y.to(flow) + flow[1]).round().long().clamp(0, height - 1)
-    return labels[rows, cols]
+    cols, rows = _places(flow).round().long()
+    return labels[rows.clamp(0, height - 1), cols.clamp(0, width - 1)]
+
+
+def _places(flow: Tensor) -> Tensor:
+    """Return the column and the row of each pixel's place in the previous image, (2, H, W)."""
+    y, x = torch.meshgrid(*(torch.arange(side) for side in flow.shape[1:]), indexing="ij")
+    return torch.stack([x, y]).to(flow) + flow

@@ -142,6 +142,9 @@ class TestRegistry:
         for name in ("auto", ""):
             with pytest.raises(InvalidArgument, match="name must be a new name"):
                 register(name)(lambda image: image[0] > 0.5)
+        register("test")(lambda image, min_size=1: image[0] > 0.5)
+        with pytest.raises(InvalidArgument, match=r"function must be without options of the clean-up.*'min_size'"):
+            segment(torch.zeros(3, 4, 4), "test", min_size=2)
 
 
 class TestAuto:

@@ -36,7 +36,9 @@ class _Segmenter:
 
     @property
     def __signature__(self) -> inspect.Signature:
-        return inspect.signature(self._function)
+        signature = inspect.signature(self._function)
+        # felzenszwalb has an option of the clean-up
+        return signature.replace(parameters=[p for p in signature.parameters.values() if p.name != "min_size"])
 
     def __call__(self, image: Tensor, *, cleanup: Cleanup, **options: Any) -> Tensor:
         """Return the segments, after the most similar neighbours have merged to ``max_regions`` of the clean-up."""
@@ -46,7 +48,7 @@ class _Segmenter:
                 check_count(name, value, least=0)
             elif type(defaults[name].default) is float:
                 check_number(name, value, 0)
-        if "min_size" in defaults:  # felzenszwalb's own option of this name
+        if "min_size" in defaults:
             options["min_size"] = cleanup.min_pixels(image[0].numel())
         with library_errors(f"{self.name} of scikit-image fails with {options}"):
             regions = connect(np.asarray(self._function(self.convert(image), **options), dtype=np.int64))
