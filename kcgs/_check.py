@@ -138,7 +138,7 @@ def _range(low: float, high: float, above: bool) -> str:
 
 def check_cutoff(value: object) -> float:
     """Return the cutoff if it is a number in [0, 1)."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
         raise InvalidArgumentType("cutoff", "a number in [0, 1)", repr(value))
     if not 0.0 <= value < 1.0:
         raise InvalidArgument("cutoff", "in [0, 1)", repr(value))

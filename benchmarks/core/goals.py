@@ -28,6 +28,8 @@ def goals_table(goals: Sequence[Goal]) -> str:
     lines = []
     for goal in goals:
         limit, measured = (format_value(goal.quantity, value) for value in (goal.limit, goal.measured))
+        if goal.missed and measured == limit:
+            measured = f"{goal.measured:.5g}"
         verb = "missed" if goal.missed else "reached"
         lines.append(
             [goal.case, title(goal.quantity), f"{'>=' if goal.more_is_better else '<='} {limit}", measured, verb]

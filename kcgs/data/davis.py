@@ -10,8 +10,9 @@ from typing import NamedTuple
 from torch import Tensor
 
 from kcgs._repr import brief
-from kcgs.data.images import load_image
-from kcgs.data.labels import load_labels
+
+from .images import load_image
+from .labels import load_labels
 
 
 @brief

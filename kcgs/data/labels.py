@@ -10,7 +10,8 @@ from torch import Tensor
 
 from kcgs._atomic import atomic_path
 from kcgs._labels import check_labels, read_labels
-from kcgs.data.colors import label_colors
+
+from .colors import label_colors
 
 
 def load_labels(path: str | os.PathLike[str], *, rgb_ids: bool = False, threshold: float | None = None) -> Tensor:

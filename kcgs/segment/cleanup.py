@@ -16,8 +16,9 @@ from kcgs._labels import check_labels
 from kcgs._repr import brief
 from kcgs.compiled import threads_for_kernels
 from kcgs.maps import Labels, RegionGraph, compact, merge_nearest
-from kcgs.segment.images import check_segment_image, lab_sums, rgb_to_lab
-from kcgs.segment.snapping import snap_contours
+
+from .images import check_segment_image, lab_sums, rgb_to_lab
+from .snapping import snap_contours
 
 # smallest region, as a share of the image: 600 pixels of 481 x 321
 _MIN_SHARE = 0.004

@@ -12,10 +12,11 @@ from torch import Tensor
 
 from kcgs._warn import warn_user
 from kcgs.errors import InvalidArgument
-from kcgs.segment.cleanup import Prediction, merge_small
-from kcgs.segment.images import reduce_image, rgb_to_lab, to_pixels
-from kcgs.segment.prompts import Box, Point, Prompt, window_of
-from kcgs.segment.snapping import snap_contours
+
+from .cleanup import Prediction, merge_small
+from .images import reduce_image, rgb_to_lab, to_pixels
+from .prompts import Box, Point, Prompt, window_of
+from .snapping import snap_contours
 
 # Tuned by the overlap with masks of DAVIS, from boxes and from masks of ISNet: `python -m benchmarks objects`.
 # width of the background around the box that GrabCut sees, in sides of the box

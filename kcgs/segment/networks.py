@@ -10,7 +10,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from kcgs._repr import shorten
-from kcgs.segment.cleanup import Prediction
+
+from .cleanup import Prediction
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from kcgs.errors import InvalidArgument, InvalidArgumentType
-from kcgs.segment.cleanup import Cleanup, Segmentation
-from kcgs.segment.images import check_segment_image
+
+from .cleanup import Cleanup, Segmentation
+from .images import check_segment_image
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 

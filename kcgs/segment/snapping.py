@@ -4,7 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcgs.maps import Labels, RegionGraph
-from kcgs.segment.images import lab_sums
+
+from .images import lab_sums
 
 # a region is thin if less than this share of its pixels lies deeper inside than `reach`
 _CORE_SHARE = 0.1

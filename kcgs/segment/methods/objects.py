@@ -13,10 +13,11 @@ from kcgs._check import check_number
 from kcgs.errors import InvalidArgument
 from kcgs.segment.cleanup import Cleanup, Prediction, merge_small
 from kcgs.segment.cutting import NAMES, correct_mask
-from kcgs.segment.methods.onnx import saliency
 from kcgs.segment.networks import IMAGENET_MEAN, IMAGENET_STD
 from kcgs.segment.prompts import Points, check_prompt, window_of
 from kcgs.segment.registry import register
+
+from .onnx import saliency
 
 _RELEASE = "https://github.com/danielgatis/rembg/releases/download/v0.0.0"
 # the folder of weights, shared with rembg
