@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,9 @@ _MIN_LEVELS = 8
 # of the pixels between dark and light, largest share whose eight neighbours have their own level
 _MAX_INTERIOR = 0.05
 
+# what to pass in place of a mask with soft edges, by a threshold
+Remedy = Callable[[int], str]
+
 
 def is_label_source(value: object) -> bool:
     """Return whether a value is of a type that `check_labels` reads."""
@@ -45,7 +48,7 @@ def check_labels(name: str, value: object, dims: Sequence[int] = (2, 3), values:
         value = _from_tensor(name, value)
     elif isinstance(value, np.ndarray):
         if values and value.ndim == 2:
-            _check_edges(name, value, f"np.asarray({name}) > {{}}")
+            _check_edges(name, value, lambda level: f"np.asarray({name}) > {level}")
         if value.dtype.kind == "f":
             value = _from_tensor(name, torch.from_numpy(np.array(value, np.float64)))
         else:
@@ -86,7 +89,10 @@ def read_labels(path: str | os.PathLike[str], rgb_ids: bool = False, threshold: 
     """Read a label map, as `kcgs.data.load_labels` documents it."""
     if threshold is not None:
         check_number("threshold", threshold, 0)
-    remedy = f"load_labels({os.fspath(path)!r}, threshold={{0}}), or --threshold {{0}}"
+
+    def remedy(value: int) -> str:
+        return f"load_labels({os.fspath(path)!r}, threshold={value}), or --threshold {value}"
+
     if Path(path).suffix.lower() == ".npy":
         try:
             values = np.asarray(np.load(path, allow_pickle=False))  # an archive becomes an object, which is no map
@@ -112,10 +118,10 @@ def _from_pil(name: str, image: Any) -> Tensor:
     if image.format is not None and not is_lossless(image):
         expected = "a label map from a lossless format (PNG, TIFF, GIF, BMP)"
         raise InvalidArgument(name, expected, f"{image.format}, whose compression can change labels")
-    return _from_samples(name, pil_indices(image), f"np.asarray({name}.convert('L')) > {{}}")
+    return _from_samples(name, pil_indices(image), lambda level: f"np.asarray({name}.convert('L')) > {level}")
 
 
-def _from_samples(name: str, values: NDArray[Any], remedy: str, threshold: float | None = None) -> Tensor:
+def _from_samples(name: str, values: NDArray[Any], remedy: Remedy, threshold: float | None = None) -> Tensor:
     if values.shape[-1] == 1:
         return _from_grey(name, values[..., 0], remedy, threshold)
     luma = _luma(values)
@@ -136,7 +142,7 @@ def _luma(values: NDArray[Any]) -> NDArray[Any]:
     return luma
 
 
-def _from_grey(name: str, values: NDArray[Any], remedy: str, threshold: float | None = None) -> Tensor:
+def _from_grey(name: str, values: NDArray[Any], remedy: Remedy, threshold: float | None = None) -> Tensor:
     if threshold is not None:
         values = values > threshold
     _check_edges(name, values, remedy)
@@ -198,13 +204,13 @@ def _sort_distinct(numbers: NDArray[Any]) -> NDArray[Any]:
     return np.concatenate([numbers[:1], numbers[1:][numbers[1:] != numbers[:-1]]])
 
 
-def _check_edges(name: str, levels: NDArray[Any], remedy: str) -> None:
+def _check_edges(name: str, levels: NDArray[Any], remedy: Remedy) -> None:
     """Refuse a mask with soft edges: levels between dark and light that occur along contours only.
 
     Args:
         name: of the map.
         levels: (H, W).
-        remedy: what to pass instead, with {} for the threshold.
+        remedy: says what to pass instead, by a threshold.
     """
     if levels.size == 0 or levels.dtype not in (np.uint8, np.uint16):
         return
@@ -220,5 +226,5 @@ def _check_edges(name: str, levels: NDArray[Any], remedy: str) -> None:
 
     interior = (minimum_filter(levels, 3) == maximum_filter(levels, 3)) & between
     if interior.sum() <= _MAX_INTERIOR * between.sum():
-        received = f"{len(ids)} grey levels, as a mask with soft edges has: pass {remedy.format((low + high) // 2)}"
+        received = f"{len(ids)} grey levels, as a mask with soft edges has: pass {remedy((low + high) // 2)}"
         raise InvalidArgument(name, "ids of regions", received, verb="hold")
