@@ -34,6 +34,9 @@ from .threads import num_threads
 
 # first column of tasks: number of tasks, counted from the first, that must be done before
 START = 0
+# columns of the tasks of `ranges`: first row and last + 1
+FIRST_ROW = 1
+END_ROW = 2
 
 # places of counters
 _TAKEN = 0

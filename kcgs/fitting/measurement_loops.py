@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from kcgs.compiled.program import Program, inner
-from kcgs.compiled.tasks import first_task, next_task, ranges, run_tasks
+from kcgs.compiled.tasks import END_ROW, FIRST_ROW, first_task, next_task, ranges, run_tasks
 
 program = Program("measurement of a fit")
 
@@ -43,7 +43,7 @@ def _sum_columns(rendered, image, is_squared, loss, squares, tasks, counters):
     _, channels, height, width = rendered.shape
     k = first_task(tasks, counters)
     while k >= 0:
-        first, last = tasks[k, 1], tasks[k, 2] - 1
+        first, last = tasks[k, FIRST_ROW], tasks[k, END_ROW] - 1
         for b in range(first // width, last // width + 1):
             begin, end = max(first - b * width, 0), min(last + 1 - b * width, width)
             for c in range(channels):

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from kcgs.compiled.program import Program, inner
-from kcgs.compiled.tasks import first_task, next_task, ranges, run_tasks
+from kcgs.compiled.tasks import END_ROW, FIRST_ROW, first_task, next_task, ranges, run_tasks
 from kcgs.functional import gaussian_taps
 
 program = Program("search for new Gaussians")
@@ -47,7 +47,7 @@ def _average(planes, labels, block, averages, tasks, counters):
     sums = np.empty((count, width * block), labels.dtype)
     k = first_task(tasks, counters)
     while k >= 0:
-        for number in range(tasks[k, 1], tasks[k, 2]):
+        for number in range(tasks[k, FIRST_ROW], tasks[k, END_ROW]):
             b, row = divmod(number, height)
             marks = labels[min(b, len(labels) - 1)]
             for x in range(width * block):
@@ -100,7 +100,7 @@ def _evaluate(planes, labels, taps, gain, colors, tasks, counters):
     is_same = np.ones(width, planes.dtype)
     k = first_task(tasks, counters)
     while k >= 0:
-        for number in range(tasks[k, 1], tasks[k, 2]):
+        for number in range(tasks[k, FIRST_ROW], tasks[k, END_ROW]):
             b, y = divmod(number, height)
             image, mark = planes[b], min(b, len(labels) - 1)
             _copy(image[:, y], columns)

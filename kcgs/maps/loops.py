@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from kcgs.compiled.program import Program, inner
-from kcgs.compiled.tasks import first_task, next_task
+from kcgs.compiled.tasks import END_ROW, FIRST_ROW, first_task, next_task
 
 from .tile import TILE
 
@@ -149,7 +149,7 @@ def cut_windows(tiles, shape, places, members, windows, tasks, counters):
     height, width = windows.shape[1:]
     task = first_task(tasks, counters)
     while task >= 0:
-        for p in range(tasks[task, 1], tasks[task, 2]):
+        for p in range(tasks[task, FIRST_ROW], tasks[task, END_ROW]):
             image, top, left = places[p]
             windows[p] = 0.0
             for row in range(max(top // TILE, 0), min((top + height - 1) // TILE + 1, rows)):
@@ -190,7 +190,7 @@ def fill_planes(index, smooth, blurs, tiles, tasks, counters):
     is_smooth = len(smooth[0]) > 0
     task = first_task(tasks, counters)
     while task >= 0:
-        for tile in range(tasks[task, 1], tasks[task, 2]):
+        for tile in range(tasks[task, FIRST_ROW], tasks[task, END_ROW]):
             first, end = starts[tile], starts[tile + 1]
             if end - first < 2:
                 continue

@@ -145,7 +145,7 @@ def _rows(*tensors: Tensor) -> list[Any]:
 def _settings(group: dict[str, Any]) -> list[Any]:
     """Return learning rate, betas and eps as floats; a rate on a device, which CUDA graphs read, stays there."""
     rate = group["lr"]
-    on_device = isinstance(rate, Tensor) and not _checks_gradients(rate)
+    on_device = isinstance(rate, Tensor) and not rate.is_cpu
     return [rate if on_device else float(rate), *map(float, (*group["betas"], group["eps"]))]
 
 

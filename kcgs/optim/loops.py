@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from kcgs.compiled.program import Program, inner
-from kcgs.compiled.tasks import first_task, next_task
+from kcgs.compiled.tasks import END_ROW, FIRST_ROW, first_task, next_task
 
 program = Program("optimizer")
 
@@ -84,7 +84,7 @@ def step_geometry(tables, gradients, moves, adam, bounds, tasks, counters):
     """Move means [N, 2] and factors [N, 3]; `moves` says which of the two is not frozen. Tasks are ranges of rows."""
     k = first_task(tasks, counters)
     while k >= 0:
-        _step_geometry(tables, gradients, moves, adam, bounds, (tasks[k, 1], tasks[k, 2]))
+        _step_geometry(tables, gradients, moves, adam, bounds, (tasks[k, FIRST_ROW], tasks[k, END_ROW]))
         k = next_task(tasks, counters, k)
 
 

@@ -15,7 +15,7 @@ from .gaussians import Gaussians
 from .objectives import ImageObjective, Residual
 
 if TYPE_CHECKING:
-    from .similarity import CompiledMsSsim
+    from .ms_ssim_compiled import CompiledMsSsim
 
 # weight of the squared error
 _SQUARED = 0.003
@@ -106,7 +106,7 @@ class MsSsim(ImageObjective):
             self._bands.append(_Band(octave, blocks + window, math.inf, of_luminance))
         self._compiled: CompiledMsSsim | None = None
         if self._scales and image.device.type == "cpu" and image.dtype == torch.float32:
-            from .similarity import CompiledMsSsim  # loads numba
+            from .ms_ssim_compiled import CompiledMsSsim  # loads numba
 
             factors = [scale.weight / self._norm * 0.25**octave for octave, scale in enumerate(self._scales, 1)]
             scales = [[plane.reshape(-1, *plane.shape[-2:]).numpy() for plane in planes] for *planes, _ in self._scales]

@@ -14,7 +14,7 @@ from torch.optim import Optimizer
 from kcgs.errors import InvalidArgument
 from kcgs.nn import GaussianField
 
-from .gaussian_adam import check_added, check_mask, rows_of, select_rows
+from .rows import check_added, check_mask, rows_of, select_rows
 
 
 class ReparametrizedOptimizer(ABC):

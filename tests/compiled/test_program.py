@@ -215,7 +215,7 @@ def test_sources_hold_all_that_loops_name(file: Path) -> None:
 @pytest.mark.parametrize(
     ("file", "source"),
     [
-        ("optim/similarity_loops.py", "functional/similarity.py"),
+        ("optim/ms_ssim_loops.py", "functional/similarity.py"),
         ("codec/labels/wavefront.py", "codec/labels/scene_prior.bin"),
         ("kernels/cpu/loops.py", "kernels/cpu/channels.py"),
     ],

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from kcgs.compiled.program import inline, inner
-from kcgs.compiled.tasks import first_task, next_task
+from kcgs.compiled.tasks import END_ROW, FIRST_ROW, first_task, next_task
 
 from ..grid_columns import FIRST_TILE, NODE_COLS, NODE_ROWS, TILE_COLS, TILE_ROWS
 from ..whitened import LEAST_SCALE, MEAN_LIMIT, SCALE, SCALE_LIMITS
@@ -104,7 +104,7 @@ def measure(batch, table, radius, spacing, order, gaussians, colors, spans, coun
     grids, channels = table.grids, batch.colors.shape[1]
     k = first_task(tasks, counters)
     while k >= 0:
-        for i in range(tasks[k, 1], tasks[k, 2]):
+        for i in range(tasks[k, FIRST_ROW], tasks[k, END_ROW]):
             g, n = gaussians[i], order[i]
             _fill(g, batch.means[n], batch.cholesky[n], len(grids), spacing)
             level = int(g[LEVEL])
@@ -139,11 +139,11 @@ def list_pairs(batch, radius, spans, blocks, histogram, lists, tasks, counters):
     k = first_task(tasks, counters)
     while k >= 0:
         if k < parts:
-            _find_blocks(batch, radius, spans, blocks, histogram[k], lists, tasks[k, 1], tasks[k, 2])
+            _find_blocks(batch, radius, spans, blocks, histogram[k], lists, tasks[k, FIRST_ROW], tasks[k, END_ROW])
         elif k == parts:
             _sum_histogram(histogram, lists)
         else:
-            _place_pairs(radius, blocks, histogram[k - parts - 1], lists, tasks[k, 1], tasks[k, 2])
+            _place_pairs(radius, blocks, histogram[k - parts - 1], lists, tasks[k, FIRST_ROW], tasks[k, END_ROW])
         k = next_task(tasks, counters, k)
 
 

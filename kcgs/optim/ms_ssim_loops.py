@@ -299,7 +299,8 @@ def run_phases(scales, difference, squared, sums, has_gradient, tasks, counters)
     """Fill the sums of scores, (T,) by task; with the last phase replace a difference by half the gradient."""
     k = first_task(tasks, counters)
     while k >= 0:
-        phase, scale, channel, first, last = tasks[k, 1], tasks[k, 2], tasks[k, 3], tasks[k, 4], tasks[k, 5]
+        phase, scale, channel = tasks[k, PHASE], tasks[k, SCALE], tasks[k, CHANNEL]
+        first, last = tasks[k, FIRST], tasks[k, LAST]
         if phase == HALVE:
             _halve(scales, difference, channel, first, last)
         elif phase == SCORE:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from kcgs.compiled.tasks import phases, run_tasks
 from kcgs.functional import window_taps
 
-from .similarity_loops import CHANNEL, HALVE, HEIGHT, MARGIN, PADDING, SCALE, SCORE, SUM, WIDTH, Scales, run_phases
+from .ms_ssim_loops import CHANNEL, HALVE, HEIGHT, MARGIN, PADDING, SCALE, SCORE, SUM, WIDTH, Scales, run_phases
 
 # rows of the finest scale per task, a multiple of the rows of a block of the coarsest scale
 _ROWS = 64
