@@ -11,7 +11,7 @@ from kcgs.maps import RegionMap
 from kcgs.nn import GaussianField, pad_rows
 from kcgs.scene import Scene
 
-from .problem import join_maps
+from .image_maps import join_maps
 
 
 class Best(NamedTuple):
@@ -20,7 +20,7 @@ class Best(NamedTuple):
     field: GaussianField
     """A batch of copies; rows that a scene lacks are unused."""
     maps: list[RegionMap | None]
-    """For each image the map of its render, which may be a batch of maps with this map at the image's index."""
+    """For each image the map of its render: of a batch of maps, the map at the image's index."""
     is_draft: Tensor
     """True for a scene rendered with the draft cutoff: all with the final cutoff rank higher. Bool, (B,)."""
     value: Tensor

@@ -10,8 +10,9 @@ from kcgs.optim import Gaussians
 from kcgs.pruning import PruneResult, prune
 from kcgs.scene import Scene
 
+from .image_maps import map_of_each
 from .measurement import Clock, Measurement, measure_errors, record, snapshot
-from .problem import Problem, map_of_each
+from .problem import Problem
 from .region_report import RegionReport, report_regions
 from .removal import remove_gaussians
 from .result import FitResult

@@ -14,7 +14,7 @@ from kcgs.maps import RegionMap
 from kcgs.nn import GaussianField
 
 from .checks import check_images_and_regions, check_num_gaussians, is_batch
-from .problem import map_of_each
+from .image_maps import map_of_each
 
 # sum of all weights at a pixel, for Gaussians with a sigma of half their spacing
 _OVERLAP = math.pi / 2

@@ -22,8 +22,9 @@ from .checkpoint import Checkpoint
 from .config import FitConfig
 from .events import Densify, HandleDivergence, Log, OnStep, Report, SettleContours, Warmup
 from .finish import finish
+from .image_maps import regions_per_map
 from .measurement import Clock
-from .problem import Problem, make_problem, regions_per_map
+from .problem import Problem, make_problem
 from .result import FitResult
 from .search import search
 from .start import start

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -19,6 +18,7 @@ from kcgs.optim import OBJECTIVES, ImageObjective, LossObjective, Objective
 
 from .checks import check_images_and_regions, check_num_gaussians, is_batch, regions_of
 from .config import FitConfig, config_for
+from .image_maps import regions_per_map
 from .user_objects import NO_OBJECTS, UserObjects
 
 # value of the target where there is no image
@@ -183,26 +183,3 @@ def _check_batch(problem: Problem) -> None:
             raise InvalidArgument(name, f"{expected} with {count} images: fit them one by one", repr(value))
     bytes_of_image = height * width * (_BYTES_PER_PIXEL + channels * _BYTES_PER_VALUE)
     check_batch_memory("image", problem.target, bytes_of_image + problem.num_gaussians * _BYTES_PER_GAUSSIAN)
-
-
-def map_of_each(regions: RegionMap, count: int) -> list[RegionMap]:
-    """Return a map for each of `count` images: its own map from a batch, else the map that all images share."""
-    return [map_of(regions, k) for k in range(count)]
-
-
-def map_of(regions: RegionMap, image: int) -> RegionMap:
-    """Return the map of an image: its own map from a batch, else the map that all images share."""
-    return regions if regions.num_maps is None else regions[image]
-
-
-def regions_per_map(regions: RegionMap) -> list[int]:
-    """Return the number of regions of each map."""
-    return [regions.num_regions] if regions.num_maps is None else [len(index.unique()) for index in regions.index]
-
-
-def join_maps(maps: Sequence[RegionMap | None]) -> RegionMap | None:
-    """Join a map for each image of a batch; a batch of maps counts as its map of that image. None without maps."""
-    first = maps[0]
-    if all(one is first for one in maps):
-        return first
-    return RegionMap.stack([map_of(one, image) for image, one in enumerate(maps) if one is not None])

@@ -16,8 +16,9 @@ from kcgs.optim import COLOR_LEARNING_RATE, LEARNING_RATE, FieldOptimizer, Gauss
 
 from .config import FitConfig
 from .gaussian_image import GaussianImageAdan
+from .image_maps import join_maps, map_of_each, regions_per_map
 from .initial import initial_sigma, random_field, uniform_field
-from .problem import Problem, join_maps, map_of_each, regions_per_map
+from .problem import Problem
 from .state import FitState
 from .user_objects import check_initial, check_optimizer
 

@@ -12,7 +12,7 @@ from .covariance import (
     covariance_to_cholesky,
     scale_rotation_to_cholesky,
 )
-from .evaluation import squared_error_gradients
+from .execution import squared_error_gradients
 from .merging import merge_regions
 from .metrics import METRICS, ef_psnr, ef_ssim, ms_ssim, psnr, ssim, ssimulacra2
 from .similarity import K1, K2, SCALE_WEIGHTS, SSIM_SIGMA, SSIM_WINDOW, window_mean, window_taps

@@ -1,6 +1,6 @@
 """`kcgs::region_splat`, the operator that torch's tools see: its schema, derivatives, shapes and vmap.
 
-Its arguments are tensors and numbers; `evaluation` computes. A forward keeps its plan for its backward on autograd's
+Its arguments are tensors and numbers; `execution` computes. A forward keeps its plan for its backward on autograd's
 context. Compilers and transforms do not see the context: their backward plans again.
 """
 
@@ -26,7 +26,7 @@ from kcgs._torch_internals import (
 from kcgs.maps import PER_MAP, SHARED, MapTable
 
 from .arguments import NUM_ARGUMENTS, SCHEMA, TABLE_PLACE, SplatArguments
-from .evaluation import Evaluation, differentiate, differentiate_forward, differentiate_twice, prepare, render
+from .execution import Execution, differentiate, differentiate_forward, differentiate_twice, prepare, render
 
 # number of arguments without a derivative
 _NUM_CONSTANTS = NUM_ARGUMENTS - 3
@@ -62,9 +62,9 @@ class _Splat(torch.autograd.Function):
     def forward(ctx: Any, *arguments: Any) -> Tensor:
         image: Tensor
         if _is_plain(arguments[:3]):  # the plan cannot pass through the operator
-            image, ctx.evaluation = below_autograd(_render, SplatArguments.of(*arguments))
+            image, ctx.execution = below_autograd(_render, SplatArguments.of(*arguments))
         else:
-            image, ctx.evaluation = _unrecorded(splat_operator, *arguments), None
+            image, ctx.execution = _unrecorded(splat_operator, *arguments), None
         ctx.save_for_backward(*arguments[:3])
         ctx.save_for_forward(*arguments[:3])
         _keep_constants(ctx, arguments[3:])
@@ -80,13 +80,13 @@ class _Splat(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         means, cholesky, colors = ctx.needs_input_grad[:3]
         gaussians, geometry = ctx.saved_tensors, means or cholesky
-        if ctx.evaluation is not None and _is_plain((grad, *gaussians)) and not torch.is_grad_enabled():
+        if ctx.execution is not None and _is_plain((grad, *gaussians)) and not torch.is_grad_enabled():
             arguments = SplatArguments.of(*gaussians, *ctx.constants)
-            gradients = below_autograd(differentiate, arguments, ctx.evaluation, grad, geometry)
+            gradients = below_autograd(differentiate, arguments, ctx.execution, grad, geometry)
         else:
             gradients = _backward_operator(grad, *gaussians, *_constants(ctx), geometry)
         if not is_graph_retained():
-            ctx.evaluation = None  # torch frees saved tensors at this time: a loss that stays alive holds no plan
+            ctx.execution = None  # torch frees saved tensors at this time: a loss that stays alive holds no plan
         needed = zip(gradients, (means, cholesky, colors), strict=True)
         return (*(g if need else None for g, need in needed), *[None] * _NUM_CONSTANTS)
 
@@ -197,16 +197,16 @@ def _unrecorded(operator: Any, *arguments: Any) -> Any:
         return below_autograd(operator, *arguments)
 
 
-# Evaluation, below autograd
+# Execution, below autograd
 
 
 def _splat(*arguments: Any) -> Tensor:
     return _render(SplatArguments.of(*arguments))[0]
 
 
-def _render(arguments: SplatArguments) -> tuple[Tensor, Evaluation]:
-    evaluation = prepare(arguments)
-    return render(arguments, evaluation), evaluation
+def _render(arguments: SplatArguments) -> tuple[Tensor, Execution]:
+    execution = prepare(arguments)
+    return render(arguments, execution), execution
 
 
 def _splat_backward(grad: Tensor, *arguments: Any) -> tuple[Tensor, Tensor, Tensor]:

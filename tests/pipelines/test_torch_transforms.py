@@ -329,9 +329,9 @@ class TestOperator:
         for _ in range(2):
             result = torch.autograd.grad(image.square().sum(), tensors, retain_graph=True)
             assert all(torch.equal(a, b) for a, b in zip(result, expected, strict=True))
-        assert image.grad_fn.evaluation is not None
+        assert image.grad_fn.execution is not None
         image.sum().backward()
-        assert image.grad_fn.evaluation is None  # a loss that stays alive for its value holds none
+        assert image.grad_fn.execution is None  # a loss that stays alive for its value holds none
 
     @pytest.mark.parametrize("name", ["region_ids", "regions"])
     @pytest.mark.parametrize("settings", [{"create_graph": True}, {"is_grads_batched": True}])

@@ -10,7 +10,7 @@ from operator import is_not
 import torch
 
 from kcgs.fitting.contour_moves import move_contours
-from kcgs.fitting.problem import join_maps, map_of, map_of_each
+from kcgs.fitting.image_maps import join_maps, map_of, map_of_each
 from kcgs.fitting.start import with_chosen_softness
 from kcgs.fitting.state import FitState
 from kcgs.maps import RegionMap

@@ -1,4 +1,4 @@
-"""The implementation of the operator: it prepares Gaussians and map for a kernel, which renders and differentiates.
+"""The execution of the operator: it prepares Gaussians and map for a kernel, which renders and differentiates.
 
 Everything here is below autograd. Values are checked here, since a traced function does not see them; the public
 function checks shapes.
@@ -19,7 +19,7 @@ from .arguments import SplatArguments
 from .values import check_region_ids, check_values
 
 
-class Evaluation(NamedTuple):
+class Execution(NamedTuple):
     """A kernel, its inputs, and its plan for them: a forward leaves all three for its backward."""
 
     kernel: Kernel
@@ -27,7 +27,7 @@ class Evaluation(NamedTuple):
     plan: Any  # in the kernel's own format
 
 
-def prepare(arguments: SplatArguments, check: bool = True) -> Evaluation:
+def prepare(arguments: SplatArguments, check: bool = True) -> Execution:
     """Prepare Gaussians and map for the kernel that the backend names, and `check` their values."""
     inputs, kernel = _make_inputs(arguments, check)
     plan = kernel.plan(inputs)
@@ -35,7 +35,7 @@ def prepare(arguments: SplatArguments, check: bool = True) -> Evaluation:
         _refuse(arguments, inputs)
     if check and kernel.looks_up_regions and plan.foreign:
         _check_ids(inputs)
-    return Evaluation(kernel, inputs, plan)
+    return Execution(kernel, inputs, plan)
 
 
 def _refuse(arguments: SplatArguments, inputs: SplatInputs) -> NoReturn:
@@ -45,20 +45,20 @@ def _refuse(arguments: SplatArguments, inputs: SplatInputs) -> NoReturn:
     raise AssertionError("bug: a kernel made no plan for valid inputs")
 
 
-def render(arguments: SplatArguments, evaluation: Evaluation) -> Tensor:
+def render(arguments: SplatArguments, execution: Execution) -> Tensor:
     """Return the image, with B where the Gaussians have it."""
-    image = evaluation.kernel.render(evaluation.plan, evaluation.inputs).contiguous()
+    image = execution.kernel.render(execution.plan, execution.inputs).contiguous()
     return image if image.ndim == arguments.means.ndim + 1 else image.squeeze(0)
 
 
 def differentiate(
-    arguments: SplatArguments, evaluation: Evaluation, grad: Tensor, geometry: bool
+    arguments: SplatArguments, execution: Execution, grad: Tensor, geometry: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the gradients of means, cholesky and colors; without `geometry` the first two are empty."""
-    inputs = evaluation.inputs
+    inputs = execution.inputs
     if grad.ndim < inputs.means.ndim + 1:
         grad = grad.unsqueeze(0)
-    gradients = evaluation.kernel.differentiate(evaluation.plan, inputs, grad, geometry)
+    gradients = execution.kernel.differentiate(execution.plan, inputs, grad, geometry)
     means, cholesky, colors = [gradients[2].new_empty(0) if g is None else g.contiguous() for g in gradients]
     if colors.ndim == arguments.colors.ndim:
         return means, cholesky, colors
@@ -83,10 +83,10 @@ def squared_error_gradients(
     table = None if regions is None else table_and_size(regions)[0]
     gaussians, size = (means.detach(), cholesky.detach(), colors.detach()), (image.shape[-2], image.shape[-1])
     arguments = SplatArguments(*gaussians, region_ids, table, size, cutoff, backend)
-    evaluation = prepare(arguments)
-    kernel, inputs, plan = evaluation
+    execution = prepare(arguments)
+    kernel, inputs, plan = execution
     if kernel.error_gradients is None:
-        return differentiate(arguments, evaluation, render(arguments, evaluation) - image, True)
+        return differentiate(arguments, execution, render(arguments, execution) - image, True)
     of_means, of_cholesky, of_colors = kernel.error_gradients(plan, inputs, image)
     assert of_means is not None and of_cholesky is not None
     return of_means, of_cholesky, of_colors
