@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 import kcgs
-from kcgs.compiled import program
+from kcgs.compiled import program, sources
 from kcgs.compiled.program import Program, inner
 
 ROOT = Path(kcgs.__file__).parent
@@ -209,7 +209,7 @@ def test_sources_hold_all_that_loops_name(file: Path) -> None:
     loops = [value for value in vars(module).values() if isinstance(getattr(value, "_cache", None), program._Cache)]
     modules = set().union(*map(find_modules, loops))
     assert module.__name__ in modules
-    assert {Path(str(sys.modules[name].__file__)) for name in modules} <= program._find_sources(ROOT / file)
+    assert {Path(str(sys.modules[name].__file__)) for name in modules} <= sources.find_sources(ROOT / file)
 
 
 @pytest.mark.parametrize(
@@ -221,9 +221,9 @@ def test_sources_hold_all_that_loops_name(file: Path) -> None:
     ],
 )
 def test_sources_that_no_loop_is_in(file: str, source: str) -> None:
-    sources = program._find_sources(ROOT / file)
-    assert ROOT / source in sources
-    assert all(path.is_relative_to(ROOT) for path in sources) and len(sources) < 40  # not all of kcgs, nor of others
+    found = sources.find_sources(ROOT / file)
+    assert ROOT / source in found
+    assert all(path.is_relative_to(ROOT) for path in found) and len(found) < 40  # not all of kcgs, nor of others
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have other places")
