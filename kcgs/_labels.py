@@ -103,9 +103,10 @@ def read_labels(path: str | os.PathLike[str], rgb_ids: bool = False, threshold: 
 
     samples = decode(path, indices=True)
     if not samples.lossless:
-        raise ValueError(
-            "path must be a label map in a lossless format (PNG, TIFF, GIF, BMP, .npy); "
-            f"got {samples.format} at {path}, whose compression can change labels"
+        raise InvalidArgument(
+            "path",
+            "a label map in a lossless format (PNG, TIFF, GIF, BMP, .npy)",
+            f"{samples.format} at {path}, whose compression can change labels",
         )
     if rgb_ids and threshold is None and samples.values.shape[-1] > 1:
         return _from_ids(samples.values, path)

@@ -1,7 +1,7 @@
 """Errors that name the argument; they survive pickling, so that worker processes can raise them.
 
-A command replaces the name of the argument by that of its option. Where no command meets the error, a plain
-`ValueError` or `TypeError` has a message of the same form.
+A command replaces the name of the argument by that of its option. Errors of the content of files, and of an argument
+that must do something else than be, have or hold, are a plain `ValueError` or `TypeError`.
 """
 
 from __future__ import annotations

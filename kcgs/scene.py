@@ -16,7 +16,7 @@ from kcgs._atomic import atomic_path
 from kcgs._check import check_size
 from kcgs._memory import check_memory
 from kcgs._repr import png, shorten
-from kcgs.errors import InvalidArgument
+from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.maps import RegionMap, as_region_map
 from kcgs.nn import GaussianField, RegionSplatRenderer, rendered_size, used_rows
 
@@ -64,7 +64,7 @@ class Scene(nn.Module):
     ) -> None:
         super().__init__()
         if not isinstance(field, GaussianField):
-            raise TypeError(f"field must be a GaussianField; got {type(field).__name__}")
+            raise InvalidArgumentType("field", "a GaussianField", type(field).__name__)
         self.field = field
         self.regions = _check_regions(field, as_region_map(regions))
         self.metadata = _check_metadata(metadata)
@@ -216,7 +216,7 @@ def empty_regions(scene: Scene) -> Tensor:
 def check_type(scene: object, name: str = "scene") -> Scene:
     """Return `scene` if it is a Scene, of one image or a batch."""
     if not isinstance(scene, Scene):
-        raise TypeError(f"{name} must be a Scene; got {type(scene).__name__}")
+        raise InvalidArgumentType(name, "a Scene", type(scene).__name__)
     return scene
 
 
@@ -232,7 +232,7 @@ def check_batch(scenes: object) -> Scene:
     """Return `scenes` if it is a batch of scenes."""
     if not isinstance(scenes, Scene) or scenes.num_images is None:
         received = "a scene of one image" if isinstance(scenes, Scene) else type(scenes).__name__
-        raise TypeError(f"scenes must be a batch of scenes; got {received}")
+        raise InvalidArgumentType("scenes", "a batch of scenes", received)
     return scenes
 
 
@@ -242,7 +242,7 @@ def check_scene(scene: object, name: str = "scene") -> Scene:
     field, regions = scene.field, scene.regions
     _check_regions(field, regions)  # checked again, since either attribute may have been assigned
     if regions is not None and regions.num_maps is not None:
-        raise ValueError(f"{name} must have one map; got a batch of {regions.num_maps}")
+        raise InvalidArgument(name, "one map", f"a batch of {regions.num_maps}", verb="have")
     if regions is not None and field.region_ids is None:
         raise ValueError(f"{name} must have region ids for its map; call {name}.field.assign_regions({name}.regions)")
     return scene
@@ -262,10 +262,12 @@ def _check_regions(field: GaussianField, regions: RegionMap | None) -> RegionMap
     if regions is None:
         return None
     if regions.size != field.size:
-        raise ValueError(f"regions must have the size {field.size} of the field; got {regions.size}")
+        raise InvalidArgument("regions", f"the size {field.size} of the field", regions.size, verb="have")
     images = field.num_images or 1
     if regions.num_maps not in (None, 1, images):
-        raise ValueError(f"regions must hold 1 map or one for each of {images} images; got {regions.num_maps} maps")
+        raise InvalidArgument(
+            "regions", f"1 map or one for each of {images} images", f"{regions.num_maps} maps", verb="hold"
+        )
     return regions
 
 

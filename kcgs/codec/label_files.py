@@ -12,6 +12,7 @@ from torch import Tensor
 
 from kcgs._check import check_count
 from kcgs._labels import check_labels
+from kcgs.errors import InvalidArgumentType
 from kcgs.maps import compact
 
 from .exact import Integers
@@ -103,7 +104,7 @@ def decode_labels(data: bytes) -> Tensor:
                 [3000000, 4000000, 5000000]])
     """
     if not isinstance(data, bytes | bytearray | memoryview):
-        raise TypeError(f"data must be bytes; got {type(data).__name__}")
+        raise InvalidArgumentType("data", "bytes", type(data).__name__)
     data = bytes(data)
     content, checksum = data[:-_CRC], data[-_CRC:]
     if not data.startswith(MAP_MAGIC):

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from kcgs._check import check_count
+from kcgs.errors import InvalidArgument
 from kcgs.maps import MAX_SOFTNESS, PairSoftness, RegionMap, compact, touching_pairs, wrap_labels
 
 from .adaptive import AdaptiveSymbol
@@ -25,7 +26,7 @@ def encode_region_map(regions: RegionMap) -> bytes:
     from .labels.stream import encode_stream  # loads numba
 
     if regions.is_resampled:
-        raise ValueError("regions must be a map of its own pixels; got one that was resized")
+        raise InvalidArgument("regions", "a map of its own pixels", "one that was resized")
     check_count("number of labels", regions.labels.numel(), 1, MAX_LABELS)
     check_count("number of regions", regions.num_regions, 1, MAX_REGIONS)
     ids, index = compact(regions.labels.cpu())[:2]

@@ -13,7 +13,7 @@ import torch
 
 from kcgs._check import check_count, check_floating, check_number
 from kcgs._repr import brief
-from kcgs.errors import InvalidArgument
+from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.functional import check_cholesky
 from kcgs.maps import RegionMap
 from kcgs.nn import GaussianField
@@ -93,7 +93,7 @@ class SceneWriter:
             ids = field.region_ids.cpu()
             self.ids = self.regions.index_of(ids).numpy()
             if (self.ids < 0).any():
-                raise ValueError(f"region_ids must be ids of the map; got {int(ids[self.ids < 0][0])}")
+                raise InvalidArgument("region_ids", "ids of the map", int(ids[self.ids < 0][0]))
             self.region_map = encode_region_map(self.regions)
 
     def qp_for(self, quality: float | None, target_bytes: int | None = None) -> int:
@@ -232,7 +232,7 @@ def decode(data: bytes, *, max_bytes: int | None = None) -> Decoded:
         (True, True)
     """
     if not isinstance(data, bytes | bytearray | memoryview):
-        raise TypeError(f"data must be bytes; got {type(data).__name__}")
+        raise InvalidArgumentType("data", "bytes", type(data).__name__)
     if max_bytes is not None:
         max_bytes = check_count("max_bytes", max_bytes)
     header, region_map, layers = unpack(bytes(data[:max_bytes]))

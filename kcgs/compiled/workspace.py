@@ -24,7 +24,7 @@ class Workspace:
     """
 
     def __init__(self) -> None:
-        self._home = _thread.spares
+        self._home = _kept.spares
         self._block = self._home.pop() if self._home else np.empty(0, np.uint8)
         self._used = self._most = 0
         self._is_lent = threading.Lock()
@@ -70,11 +70,11 @@ def borrowed(array: Any) -> Any:
     return np.ndarray(array.shape, array.dtype, (ctypes.c_byte * array.nbytes).from_address(array.ctypes.data))
 
 
-class Thread(threading.local):
+class _Kept(threading.local):
     """What a thread keeps between calls: a block, or nothing."""
 
     def __init__(self) -> None:
         self.spares: list[Any] = []
 
 
-_thread = Thread()
+_kept = _Kept()

@@ -11,6 +11,7 @@ from torch import Tensor
 from kcgs._check import check_count
 from kcgs._image import as_image
 from kcgs._labels import check_labels
+from kcgs.errors import InvalidArgument
 from kcgs.maps import interior_points, touching_pairs
 
 # step of the hue, the golden ratio minus 1: consecutive hues are spread over the circle
@@ -112,9 +113,11 @@ def overlay_labels(image: Any, labels: Tensor, *, ids: bool = False) -> Tensor:
     image = as_image("image", image, tolerance=math.inf).detach()
     names, regions = (t.cpu() for t in check_labels("labels", labels, dims=(2,)).unique(return_inverse=True))
     if image.shape[0] not in (1, 3) or image.shape[1:] != regions.shape:
-        raise ValueError(
-            f"image must have shape (3, H, W) or (1, H, W) with the size of labels, {tuple(regions.shape)}; got "
-            f"{tuple(image.shape)}"
+        raise InvalidArgument(
+            "image",
+            f"shape (3, H, W) or (1, H, W) with the size of labels, {tuple(regions.shape)}",
+            tuple(image.shape),
+            verb="have",
         )
     pixels = image.float().clamp(0, 1).expand(3, -1, -1).permute(1, 2, 0).cpu().numpy()
     colors = _neighbour_colors(regions)[regions].numpy()

@@ -13,6 +13,7 @@ from torch import Tensor
 from kcgs._atomic import atomic_path
 from kcgs._image import as_image, read_image
 from kcgs._suffixes import WRITTEN_IMAGES
+from kcgs.errors import InvalidArgument
 
 _MODES = {1: "L", 3: "RGB", 4: "RGBA"}
 # options of Pillow, by format
@@ -54,7 +55,7 @@ def load_image(path: str | os.PathLike[str], *, channels: Literal["RGB", "L", "R
         ((3, 2, 5), 0.2)
     """
     if channels not in _MODES.values():
-        raise ValueError(f'channels must be "RGB", "L" or "RGBA"; got {channels!r}')
+        raise InvalidArgument("channels", '"RGB", "L" or "RGBA"', repr(channels))
     return read_image(path, channels)
 
 
@@ -83,7 +84,7 @@ def save_image(path: str | os.PathLike[str], image: Any) -> None:
     """
     image = as_image("image", image, tolerance=math.inf, keep_alpha=True)
     if image.shape[0] not in _MODES:
-        raise ValueError(f"image must have shape (1, H, W), (3, H, W) or (4, H, W); got {tuple(image.shape)}")
+        raise InvalidArgument("image", "shape (1, H, W), (3, H, W) or (4, H, W)", tuple(image.shape), verb="have")
     suffix = Path(path).suffix.lower()
     if suffix not in WRITTEN_IMAGES:
         raise ValueError(f"path must end in {', '.join(WRITTEN_IMAGES)}; got {str(path)!r}")

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kcgs._check import check_floating, check_number
 from kcgs._image import LUMA
-from kcgs.errors import InvalidArgument
+from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.nn import GaussianField, join
 from kcgs.scene import Scene, check_type
 
@@ -80,7 +80,7 @@ def recolor_region(
         raise ValueError("scene must have region ids; call scene.field.assign_regions(regions)")
     ids = unique_region_ids(region_ids, field.region_ids, "Gaussians")
     if (color is None) == (gain is None and bias is None):
-        raise ValueError("color must be given, or gain or bias; got both or neither")
+        raise InvalidArgument("color", "given, or gain or bias", "both or neither")
     if color is None:
         if strength is not None:
             raise InvalidArgument("strength", "None without color", strength)
@@ -152,11 +152,11 @@ def _color_tensor(name: str, value: Numbers, colors: Tensor, shapes: list[tuple[
         try:
             value = torch.as_tensor(value, dtype=colors.dtype)
         except (TypeError, ValueError) as error:
-            raise TypeError(f"{name} must hold numbers; got {value!r}") from error
+            raise InvalidArgumentType(name, "numbers", repr(value), verb="hold") from error
     number = value if isinstance(value, Tensor) else colors.new_tensor(check_number(name, value))
     tensor = check_floating(name, number).detach().to(colors)
     if tuple(tensor.shape) not in shapes:
-        raise ValueError(f"{name} must have shape {' or '.join(map(str, shapes))}; got {tuple(tensor.shape)}")
+        raise InvalidArgument(name, f"shape {' or '.join(map(str, shapes))}", tuple(tensor.shape), verb="have")
     return tensor
 
 

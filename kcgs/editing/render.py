@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_image, check_size
+from kcgs.errors import InvalidArgument
 from kcgs.functional import region_splat
 from kcgs.nn import GaussianField, RegionSplatRenderer, area_mean, rendered_size, scaled_gaussians
 from kcgs.scene import Scene
@@ -90,7 +91,7 @@ def render_over(scene: Scene, region_ids: int | Iterable[int], image: Tensor) ->
     selection, field = select_regions(scene, region_ids), scene.field
     channels = field.colors.shape[-1]
     if image.ndim != 3 or image.shape[0] != channels:
-        raise ValueError(f"image must have shape ({channels}, H, W); got {tuple(image.shape)}")
+        raise InvalidArgument("image", f"shape ({channels}, H, W)", tuple(image.shape), verb="have")
     target = (image.shape[-2], image.shape[-1])
     rows = ~selection.members
     tensors = field.means, field.cholesky, field.merged_colors(), field.region_ids

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 import torch
 
 from kcgs._check import check_count
+from kcgs.errors import InvalidArgument
 from kcgs.maps import PairSoftness, RegionMap, nearest_labels, touching_pairs
 from kcgs.nn import GaussianField, join, scaled_gaussians
 from kcgs.scene import Scene, check_scene
@@ -160,7 +161,7 @@ def replace_background(scene: Scene, region_ids: int | Iterable[int], background
     other, field = check_scene(background, "background").field, scene.field
     channels = field.colors.shape[-1]
     if other.colors.shape[-1] != channels:
-        raise ValueError(f"background must have {channels} channels; got {other.colors.shape[-1]}")
+        raise InvalidArgument("background", f"{channels} channels", other.colors.shape[-1], verb="have")
     first_id = int(regions.ids.max()) + 1
     background_labels = torch.full_like(regions.labels, first_id)
     ids = background_labels.new_full((other.num_gaussians,), first_id)

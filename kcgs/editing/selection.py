@@ -64,7 +64,7 @@ def unique_region_ids(region_ids: object, known: Tensor, owner: str) -> list[int
     sequence = region_ids if isinstance(region_ids, Iterable) and not has_one else [region_ids]
     ids = sorted({check_count("region_ids", region, 0) for region in sequence})
     if not ids:
-        raise ValueError("region_ids must hold an id; got none")
+        raise InvalidArgument("region_ids", "an id", "none", verb="hold")
     known_ids = known.unique().tolist()
     for region in ids:
         if region not in known_ids:

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_number
+from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.maps import MAX_SOFTNESS
 
 from .contour_windows import ContourWindows, WindowErrors, measure_windows
@@ -137,7 +138,7 @@ def _best_softness(error: list[float], tie: float, candidates: Sequence[float]) 
 
 def _check_candidates(candidates: Sequence[float]) -> list[float]:
     if isinstance(candidates, str) or not isinstance(candidates, Sequence):
-        raise TypeError(f"candidates must be a sequence of numbers; got {candidates!r}")
+        raise InvalidArgumentType("candidates", "a sequence of numbers", repr(candidates))
     if not candidates:
-        raise ValueError("candidates must be one or more numbers; got none")
+        raise InvalidArgument("candidates", "one or more numbers", "none")
     return sorted({check_number("each of candidates", c, 0.0, MAX_SOFTNESS, unit="pixels") for c in candidates})

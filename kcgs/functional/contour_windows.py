@@ -16,6 +16,7 @@ from torch import Tensor
 
 from kcgs._check import check_floating
 from kcgs._labels import check_labels
+from kcgs.errors import InvalidArgument
 from kcgs.maps import RADIUS_SIGMAS, contour_edges, truncated_gaussian, unique_pairs
 
 _HALF = 6  # pixels that a window reaches from its centre, or twice the largest candidate if that is more
@@ -78,8 +79,8 @@ def check_image_and_labels(image: Tensor, labels: Tensor) -> tuple[Tensor, Tenso
     image = check_floating("image", image, dims=(3,))
     labels = check_labels("labels", labels, dims=(2,))
     if image.shape[0] == 0 or image.shape[1:] != labels.shape:
-        raise ValueError(
-            f"image must have shape (C, {labels.shape[0]}, {labels.shape[1]}) with labels; got {tuple(image.shape)}"
+        raise InvalidArgument(
+            "image", f"shape (C, {labels.shape[0]}, {labels.shape[1]}) with labels", tuple(image.shape), verb="have"
         )
     return image.double() if image.is_cuda else image.float().cpu(), labels.cpu()
 

@@ -65,11 +65,11 @@ def covariance_to_cholesky(covariance: Tensor) -> Tensor:
     """
     covariance = check_floating("covariance", covariance, last=2)
     if covariance.ndim < 2 or covariance.shape[-2] != 2:
-        raise ValueError(f"covariance must have shape (..., 2, 2); got {tuple(covariance.shape)}")
+        raise InvalidArgument("covariance", "shape (..., 2, 2)", tuple(covariance.shape), verb="have")
     s_xx, s_xy, s_yy = covariance[..., 0, 0], covariance[..., 1, 0], covariance[..., 1, 1]
     schur = s_yy - s_xy * s_xy / s_xx  # the Schur complement, l22 squared
     if not ((s_xx > 0) & (schur > 0)).all():
-        raise ValueError("covariance must be positive definite; got a matrix that is not")
+        raise InvalidArgument("covariance", "positive definite", "a matrix that is not")
     l11 = s_xx.sqrt()
     return torch.stack([l11, s_xy / l11, schur.sqrt()], -1)
 
@@ -94,9 +94,9 @@ def scale_rotation_to_cholesky(scales: Tensor, angle: Tensor) -> Tensor:
     scales = check_floating("scales", scales, last=2)
     angle = check_floating("angle", angle)
     if not (scales > 0).all():
-        raise ValueError(f"scales must be positive; got a least of {scales.min().item():g}")
+        raise InvalidArgument("scales", "positive", f"a least of {scales.min().item():g}")
     if scales.shape[:-1] != angle.shape:
-        raise ValueError(f"angle must have shape {tuple(scales.shape[:-1])}; got {tuple(angle.shape)}")
+        raise InvalidArgument("angle", f"shape {tuple(scales.shape[:-1])}", tuple(angle.shape), verb="have")
     s1, s2 = scales.unbind(-1)
     cos, sin = torch.cos(angle), torch.sin(angle)
     l11 = torch.hypot(s1 * cos, s2 * sin)

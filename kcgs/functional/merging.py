@@ -58,7 +58,7 @@ def merge_regions(
     if objects is not None:
         objects = check_labels("objects", objects, dims=(2,)).to(ids)
         if objects.shape != labels.shape:
-            raise ValueError(f"objects must have shape {tuple(labels.shape)}; got {tuple(objects.shape)}")
+            raise InvalidArgument("objects", f"shape {tuple(labels.shape)}", tuple(objects.shape), verb="have")
         owners[labels] = objects
         if (crossing := owners[labels] != objects).any():
             received = f"a contour through the region {int(ids[labels[crossing][0]])}"

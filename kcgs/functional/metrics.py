@@ -14,6 +14,7 @@ from torch.nn.functional import avg_pool2d, pad
 from kcgs._check import check_image
 from kcgs._labels import check_labels
 from kcgs._warn import warn_user
+from kcgs.errors import InvalidArgument
 from kcgs.maps import edge_band
 
 from .similarity import SCALE_WEIGHTS, SSIM_WINDOW, mean_ssim
@@ -224,9 +225,9 @@ def _check_pair(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor, torch.Si
     check_image("image", image)
     check_image("target", target)
     if target.shape != image.shape:
-        raise ValueError(f"target must have the shape of image, {tuple(image.shape)}; got {tuple(target.shape)}")
+        raise InvalidArgument("target", f"the shape of image, {tuple(image.shape)}", tuple(target.shape), verb="have")
     if target.device != image.device:
-        raise ValueError(f"target must be on {image.device} with image; got {target.device}")
+        raise InvalidArgument("target", f"on {image.device} with image", target.device)
     dtype = torch.promote_types(torch.promote_types(image.dtype, target.dtype), torch.float32)
     batch_shape = image.shape[:-3]
     image, target = (t.to(dtype).clamp(0.0, 1.0).reshape(-1, *t.shape[-3:]) for t in (image, target))
@@ -237,13 +238,15 @@ def _check_band(name: str, image: Tensor, labels: Tensor, width: float) -> Tenso
     """Validate the label map against a batched image and return its band, (B or 1, 1, H, W) bool."""
     labels = check_labels("labels", labels)
     if labels.device != image.device:
-        raise ValueError(f"labels must be on {image.device} with image; got {labels.device}")
+        raise InvalidArgument("labels", f"on {image.device} with image", labels.device)
     batch, _, height, breadth = image.shape
     maps = labels.shape[0] if labels.ndim == 3 else 1
     if labels.shape[-2:] != (height, breadth) or maps not in (1, batch):
-        raise ValueError(
-            f"labels must have shape ({height}, {breadth}) or ({batch}, {height}, {breadth}) to fit image; got "
-            f"{tuple(labels.shape)}"
+        raise InvalidArgument(
+            "labels",
+            f"shape ({height}, {breadth}) or ({batch}, {height}, {breadth}) to fit image",
+            tuple(labels.shape),
+            verb="have",
         )
     band = edge_band(labels, width).reshape(maps, 1, height, breadth)
     empty = (~band.flatten(1).any(1)).sum()

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from kcgs._check import check_cutoff, check_floating, check_ids, check_rows, check_size
 from kcgs._torch_internals import register_decomposition
+from kcgs.errors import InvalidArgument
 from kcgs.kernels import check_backend
 from kcgs.maps import MapTable, RegionMap, table_and_size
 
@@ -74,12 +75,13 @@ def region_splat(
         size = check_size("size", size)
     if regions is None:
         if region_ids is not None:
-            raise ValueError(
-                "regions must be given with region_ids; got None: pass the label map, or leave region_ids out, too, to "
-                "render Gaussians that are not confined"
+            raise InvalidArgument(
+                "regions",
+                "given with region_ids",
+                "None: pass the label map, or leave region_ids out, too, to render Gaussians that are not confined",
             )
         if size is None:
-            raise ValueError("size must be given as (height, width) where regions is None; got None")
+            raise InvalidArgument("size", "given as (height, width) where regions is None", "None")
         return splat_at(size, means, cholesky, colors, cutoff=cutoff, backend=backend)
     table, map_size = table_and_size(regions)
     if size not in (None, map_size):
@@ -119,15 +121,15 @@ def _check_gaussians(means: Tensor, cholesky: Tensor, colors: Tensor) -> None:
     check_rows("colors", colors, means, "C")
     for name, tensor in (("cholesky", cholesky), ("colors", colors)):
         if tensor.device != means.device:
-            raise ValueError(f"{name} must be on {means.device} with means; got {tensor.device}")
+            raise InvalidArgument(name, f"on {means.device} with means", tensor.device)
     if means.ndim == 3 and means.shape[0] == 0:
-        raise ValueError(f"means must hold at least one image; got shape {tuple(means.shape)}")
+        raise InvalidArgument("means", "at least one image", f"shape {tuple(means.shape)}", verb="hold")
 
 
 def _check_map(table: MapTable, means: Tensor) -> None:
     if table.labels.device != means.device:
-        raise ValueError(f"regions must be on {means.device} with means; got {table.labels.device}")
+        raise InvalidArgument("regions", f"on {means.device} with means", table.labels.device)
     maps = table.shape[0]
     images = means.shape[0] if means.ndim == 3 else 1
     if maps not in (1, images):
-        raise ValueError(f"regions must hold 1 map or one for each of {images} images; got {maps} maps")
+        raise InvalidArgument("regions", f"1 map or one for each of {images} images", f"{maps} maps", verb="hold")

@@ -42,7 +42,7 @@ def check_region_ids(region_ids: Tensor, index: Tensor) -> None:
     if not region_ids.numel():
         return
     if int(region_ids.min()) < 0:
-        raise ValueError(f"region_ids must be non-negative; got {int(region_ids.min())}")
+        raise InvalidArgument("region_ids", "non-negative", int(region_ids.min()))
     foreign = region_ids.view_as(index)[index < 0]
     if len(foreign):
         warn_user(

@@ -6,6 +6,7 @@ import numpy as np
 from torch import Tensor
 
 from kcgs._labels import check_labels, is_label_source
+from kcgs.errors import InvalidArgumentType
 
 from .regions import RegionMap
 from .table import MapTable
@@ -17,7 +18,7 @@ def as_region_map(value: object, name: str = "regions") -> RegionMap | None:
         return value
     if is_label_source(value):
         return RegionMap(check_labels(name, value))
-    raise TypeError(f"{name} must be a RegionMap, a label map or None; got {type(value).__name__}")
+    raise InvalidArgumentType(name, "a RegionMap, a label map or None", type(value).__name__)
 
 
 def table_and_size(regions: object) -> tuple[MapTable, tuple[int, int]]:
@@ -28,4 +29,4 @@ def table_and_size(regions: object) -> tuple[MapTable, tuple[int, int]]:
         table = MapTable(check_labels("regions", regions, values=False))
         return table, table.size
     hint = ": RegionMap(regions) reads it, once for all renders" if is_label_source(regions) else ""
-    raise TypeError(f"regions must be a RegionMap, a Tensor, an array or None; got {type(regions).__name__}{hint}")
+    raise InvalidArgumentType("regions", "a RegionMap, a Tensor, an array or None", f"{type(regions).__name__}{hint}")

@@ -12,6 +12,7 @@ from torch import Tensor
 from kcgs._check import check_floating, check_number
 from kcgs._labels import check_labels
 from kcgs._rows import row_slices
+from kcgs.errors import InvalidArgument
 
 _PIXELS = 1 << 18  # per slice of a map whose pairs are listed; it bounds the memory for maps of noise
 _TABLE_IDS = 1 << 16  # up to this id a table is ten times faster than sorting every pixel
@@ -153,7 +154,7 @@ def union_find(ids: Iterable[int], pairs: Iterable[tuple[int, int]]) -> Callable
 
     def find(region: int) -> int:
         if region not in root:
-            raise ValueError(f"pairs must hold ids of the map; got {region}")
+            raise InvalidArgument("pairs", "ids of the map", region, verb="hold")
         while root[region] != region:
             region = root[region]
         return region

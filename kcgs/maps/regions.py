@@ -212,7 +212,7 @@ class RegionMap:
         """
         labels = check_labels("labels", labels)
         if labels.shape != self._labels.shape:
-            raise ValueError(f"labels must have shape {tuple(self._labels.shape)}; got {tuple(labels.shape)}")
+            raise InvalidArgument("labels", f"shape {tuple(self._labels.shape)}", tuple(labels.shape), verb="have")
         if new_contours not in ("hard", "mean"):
             raise InvalidArgument("new_contours", "'hard' or 'mean'", repr(new_contours))
         if not self._labels.is_cpu:  # the host would wait for the device at every step

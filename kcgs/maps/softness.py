@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_number
+from kcgs.errors import InvalidArgument
 
 from .labels import touching_pairs
 from .resampled import contour_variance
@@ -70,7 +71,7 @@ def check_softness(softness: object, ids: Tensor, index: Tensor, is_batch: bool)
         return _check_one(softness, ids)
     if not is_batch or len(softness) != len(index):
         expected = f"one, or one for each of {len(index)} maps" if is_batch else "that of one map"
-        raise ValueError(f"softness must be {expected}; got {len(softness)} of them")
+        raise InvalidArgument("softness", expected, f"{len(softness)} of them")
     parts = tuple(_check_one(part, ids[one.unique().long()]) for part, one in zip(softness, index, strict=True))
     return parts[0] if all(part == parts[0] for part in parts) else parts
 

@@ -156,7 +156,7 @@ class GaussianField(nn.Module):
         labels = regions.labels if isinstance(regions, RegionMap) else check_labels("regions", regions)
         ids = lookup_regions(self.means, labels)
         if tuple(labels.shape[-2:]) != self.size:
-            raise ValueError(f"regions must have the field's size {self.size}; got {tuple(labels.shape[-2:])}")
+            raise InvalidArgument("regions", f"the field's size {self.size}", tuple(labels.shape[-2:]), verb="have")
         self.register_buffer("region_ids", ids.to(self.means.device))
         return self
 

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from kcgs._check import check_cutoff, check_size
 from kcgs._sizes import is_equal
+from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.functional import splat_at
 from kcgs.kernels import check_backend
 from kcgs.maps import RegionMap, table_and_size
@@ -79,21 +80,22 @@ class RegionSplatRenderer(nn.Module):
         if not isinstance(field, GaussianField):
             # isinstance(field, SceneLike) would take as long as the rest of this module
             if not isinstance(getattr(field, "field", None), GaussianField):
-                raise TypeError(f"field must be a GaussianField or a Scene; got {type(field).__name__}")
+                raise InvalidArgumentType("field", "a GaussianField or a Scene", type(field).__name__)
             regions = field.regions if regions is None else regions
             field = field.field
         size = field.size if size is None else check_size("size", size)
         table, map_size = (None, size) if regions is None else table_and_size(regions)
         if table is None and field.region_ids is not None:
-            raise ValueError(
-                "regions must be given for a field that is confined to regions; got None: pass its label map or its "
-                "Scene, or set field.region_ids to None to render it without contours"
+            raise InvalidArgument(
+                "regions",
+                "given for a field that is confined to regions",
+                "None: pass its label map or its Scene, or set field.region_ids to None to render it without contours",
             )
         if table is not None and field.region_ids is None:
             raise ValueError("field must have region_ids where regions are given; call field.assign_regions(regions)")
         if map_size not in (field.size, size):
             other = "" if size == field.size else f" or {size}"
-            raise ValueError(f"regions must have the size {field.size} of the field{other}; got {map_size}")
+            raise InvalidArgument("regions", f"the size {field.size} of the field{other}", map_size, verb="have")
         # a map of the image's size cannot be sampled between its pixels: no larger render is averaged
         resized = table is not None and map_size != field.size
         fine = size if resized else rendered_size(field.size, size)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import onnx
 
 from kcgs._check import check_cutoff
+from kcgs.errors import InvalidArgument
 from kcgs.functional import check_values
 from kcgs.scene import Scene, check_scene
 
@@ -58,7 +59,7 @@ def scene_decoder(
     """
     regions = check_scene(scene).regions
     if regions is not None and regions.is_resampled:
-        raise ValueError("scene must have the map itself; got one that was resized")
+        raise InvalidArgument("scene", "the map itself", "one that was resized", verb="have")
     cutoff = check_cutoff(cutoff)
     field = scene.field
     check_values(*(values.detach().float() for values in (field.means, field.cholesky, field.merged_colors())))

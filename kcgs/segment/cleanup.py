@@ -15,6 +15,7 @@ from kcgs._check import check_count
 from kcgs._labels import check_labels
 from kcgs._repr import brief
 from kcgs.compiled import threads_for_kernels
+from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.maps import Labels, RegionGraph, compact, merge_nearest
 
 from .images import check_segment_image, lab_sums, rgb_to_lab
@@ -76,7 +77,7 @@ class Cleanup:
             if getattr(self, name) is not None:
                 check_count(name, getattr(self, name))
         if not isinstance(self.connected, bool):
-            raise TypeError(f"connected must be True or False; got {self.connected!r}")
+            raise InvalidArgumentType("connected", "True or False", repr(self.connected))
 
     def min_pixels(self, num_pixels: int) -> int:
         """Return the least number of pixels of a region, for an image of `num_pixels`."""
@@ -101,11 +102,11 @@ class Cleanup:
         scores = None if scores is None else torch.as_tensor(scores).detach().double().cpu()
         for name, values in (("labels", classes), ("scores", scores)):
             if values is not None and values.shape != pixels.shape[1:]:
-                raise ValueError(
-                    f"{name} must have the image's size {tuple(pixels.shape[1:])}; got {tuple(values.shape)}"
+                raise InvalidArgument(
+                    name, f"the image's size {tuple(pixels.shape[1:])}", tuple(values.shape), verb="have"
                 )
         if names is not None and int(classes.max()) >= len(names):
-            raise ValueError(f"names must have one for label {int(classes.max())}; got {len(names)} names")
+            raise InvalidArgument("names", f"one for label {int(classes.max())}", f"{len(names)} names", verb="have")
         with threads_for_kernels(classes.numel()):
             regions = self._clean(pixels, to_regions(classes.numpy()))
         return Segmentation(

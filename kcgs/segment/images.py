@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kcgs._image import as_image
+from kcgs.errors import InvalidArgument
 from kcgs.maps import Labels
 
 # distance by which values may lie outside [0, 1], as after resizing or colour conversion
@@ -21,7 +22,7 @@ def check_segment_image(image: Any) -> Tensor:
     """Return an image as (3, H, W) float32 in [0, 1], grey repeated, with the memory layout of (H, W, 3)."""
     tensor = as_image("image", image, tolerance=_TOLERANCE).detach()
     if tensor.shape[0] not in (1, 3):
-        raise ValueError(f"image must have shape (3, H, W) or (1, H, W); got {tuple(tensor.shape)}")
+        raise InvalidArgument("image", "shape (3, H, W) or (1, H, W)", tuple(tensor.shape), verb="have")
     return tensor.float().clamp(0, 1).expand(3, -1, -1).permute(1, 2, 0).contiguous().permute(2, 0, 1)
 
 

@@ -18,6 +18,7 @@ from kcgs._check import check_number
 from kcgs._image import as_image
 from kcgs._suffixes import LABEL_MAPS, VIDEOS, WRITTEN_IMAGES
 from kcgs.data import load_image, load_labels, save_image
+from kcgs.errors import InvalidArgument
 
 # frames per second if a file or an iterable has no rate
 DEFAULT_FRAME_RATE = 24.0
@@ -193,7 +194,7 @@ def _check_frames(frames: Iterable[Any]) -> Iterator[Tensor]:
             raise ValueError(f"frame {number} must have shape {shape}; got {tuple(image.shape)}")
         yield image
     if not shape:
-        raise ValueError("frames must hold at least one frame; got none")
+        raise InvalidArgument("frames", "at least one frame", "none", verb="hold")
 
 
 def _encode(path: Path, images: Iterator[Tensor], size: tuple[int, int], rate: Fraction) -> None:

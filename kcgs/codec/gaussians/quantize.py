@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kcgs.codec.exact import LN2, Floats, Integers, cos_sin, exp2
+from kcgs.errors import InvalidArgument
 
 from .occupancy import Grid
 
@@ -160,9 +161,10 @@ class Quantizer:
         angle = np.floor(radians / math.pi * num_angles + 0.5).astype(np.int64) % num_angles
         color_codes = steps.round_colors(colors)
         if not (np.abs(color_codes) < _MAX_COLOR).all():
-            raise ValueError(
-                f"colors must be below {_MAX_COLOR:g} steps of {steps.color.min():.3g} at this quality; got colors "
-                f"up to {np.abs(colors).max():.3g}"
+            raise InvalidArgument(
+                "colors",
+                f"below {_MAX_COLOR:g} steps of {steps.color.min():.3g} at this quality",
+                f"colors up to {np.abs(colors).max():.3g}",
             )
         cell, place = self._locate(means, steps.shape(scale, ratio, angle / num_angles), steps)
         return Codes(*classes, scale, ratio, angle, color_codes.astype(np.int64), cell, place)

@@ -14,6 +14,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from kcgs.errors import InvalidArgument
 from kcgs.maps import TILE, table_at
 
 from ..interface import SplatInputs
@@ -82,7 +83,7 @@ def plan(inputs: SplatInputs) -> CudaPlan | None:
     grid, (height, width), device = grid_of(inputs), inputs.size, means.device
     cell_rows, cell_cols = -(-grid.rows // _CELL.value), -(-grid.cols // _CELL.value)
     if max(grid.rows, grid.cols) > _MOST_TILES:
-        raise ValueError(f"size must be at most {_MOST_TILES * TILE} on backend 'cuda'; got {inputs.size}")
+        raise InvalidArgument("size", f"at most {_MOST_TILES * TILE} on backend 'cuda'", inputs.size)
     num_cells, total = grid.batch * cell_rows * cell_cols, grid.batch * count
     radius, room, foreign, notes = support_radius(inputs.cutoff, means.dtype), reserve(inputs), 0, notes_of(device)
     waits = room is None

@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from kcgs._check import check_count
+from kcgs.errors import InvalidArgument
 from kcgs.segment.cleanup import Prediction
 from kcgs.segment.clustering import k_means
 from kcgs.segment.networks import load_pretrained, preprocess
@@ -66,7 +67,7 @@ def patch_features(image: Tensor, model: str | os.PathLike[str] | Any, longer_si
     network = load_pretrained("AutoModel", model, image.device)
     patch = getattr(network.config, "patch_size", None)
     if not isinstance(patch, int):
-        raise ValueError(f"model must be a vision transformer with patches; got {type(network).__name__}")
+        raise InvalidArgument("model", "a vision transformer with patches", type(network).__name__)
     longer = max(image.shape[1:])
     rows, columns = (max(1, round(side * longer_side / longer / patch)) for side in image.shape[1:])
     # DINO takes another number of patches only with this option; later models always do

@@ -134,14 +134,14 @@ def lseg(
     _check_names(names, len(texts))
     features = _run(image, model, size, mean, std)
     if len(features) != texts.shape[1]:
-        raise ValueError(f"embeddings must have shape (K, {len(features)}); got {tuple(texts.shape)}")
+        raise InvalidArgument("embeddings", f"shape (K, {len(features)})", tuple(texts.shape), verb="have")
     similarity = torch.einsum("dhw,kd->khw", F.normalize(features, dim=0), F.normalize(texts, dim=1))
     return predict_labels(similarity / _TEMPERATURE, image.shape[1:], names)
 
 
 def _check_names(names: Sequence[str] | None, classes: int) -> None:
     if names is not None and len(names) != classes:
-        raise ValueError(f"names must be {classes}, one for each class, class 0 first; got {len(names)}")
+        raise InvalidArgument("names", f"{classes}, one for each class, class 0 first", len(names))
 
 
 def _run(

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from kcgs._check import check_number
+from kcgs.errors import InvalidArgument, InvalidArgumentType
 from kcgs.segment.cleanup import Prediction
 from kcgs.segment.networks import library_errors, load_pretrained, predict_labels, preprocess
 from kcgs.segment.registry import register
@@ -44,11 +45,11 @@ def text(
         ``segment(image, "text", prompts=["a cat", "a sofa", "the wall"])``
     """
     if isinstance(prompts, str) or not all(isinstance(prompt, str) for prompt in prompts):
-        raise TypeError(f"prompts must be a list of strings; got {prompts!r}")
+        raise InvalidArgumentType("prompts", "a list of strings", repr(prompts))
     if threshold is not None:
         check_number("threshold", threshold, 0, 1)
     if len(prompts) < (2 if threshold is None else 1):
-        raise ValueError(f"prompts must be at least 2, or 1 with a threshold; got {list(prompts)!r}")
+        raise InvalidArgument("prompts", "at least 2, or 1 with a threshold", repr(list(prompts)))
     network = load_pretrained("CLIPSegForImageSegmentation", model, image.device)
     with library_errors(f"cannot load the tokenizer of {network.name_or_path!r}"):
         from transformers import AutoTokenizer
