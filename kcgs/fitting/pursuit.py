@@ -257,7 +257,7 @@ def _scales(residual: Tensor, labels: Tensor | None) -> Iterator[_Scale]:
         planes = _average(pixels, labels, block)
         middle_labels = None if labels is None else _middles(labels, block).contiguous()
         for sigma in sigmas:
-            gain, colors = _evaluate(planes, middle_labels, sigma / block)
+            gain, colors = _gains(planes, middle_labels, sigma / block)
             yield _Scale(sigma, block, gain.mul_(block**2), colors)
 
 
@@ -297,7 +297,7 @@ def _average(planes: Tensor, labels: Tensor | None, block: int) -> Tensor:
     return planes
 
 
-def _evaluate(planes: Tensor, labels: Tensor | None, sigma: float) -> tuple[Tensor, Tensor]:
+def _gains(planes: Tensor, labels: Tensor | None, sigma: float) -> tuple[Tensor, Tensor]:
     """Return gain (B, H, W) and colours of Gaussians at the pixels of planes, (B, C + 1, H, W).
 
     The last plane has the pixels' weights. Filters run along columns, then along rows, each over pixels of the same
@@ -306,9 +306,9 @@ def _evaluate(planes: Tensor, labels: Tensor | None, sigma: float) -> tuple[Tens
     """
     arguments = planes, labels, sigma, math.ceil(_REACH * sigma)
     if not takes_triton(planes):
-        from .pursuit_loops import evaluate  # loads numba
+        from .pursuit_loops import gains  # loads numba
 
-        return evaluate(*arguments)
+        return gains(*arguments)
     from .pursuit_cuda import blur  # loads triton
 
     blurred = blur(*arguments)

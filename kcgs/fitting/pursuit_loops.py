@@ -66,7 +66,7 @@ def _average(planes, labels, block, averages, tasks, counters):
         k = next_task(tasks, counters, k)
 
 
-def evaluate(planes: Tensor, labels: Tensor | None, sigma: float, reach: int) -> tuple[Tensor, Tensor]:
+def gains(planes: Tensor, labels: Tensor | None, sigma: float, reach: int) -> tuple[Tensor, Tensor]:
     """Filter planes of images along columns, then along rows, each time over pixels of the same label only.
 
     Args:
@@ -87,12 +87,12 @@ def evaluate(planes: Tensor, labels: Tensor | None, sigma: float, reach: int) ->
     taps = np.array([gaussian_taps(sigma, reach)] * (count - 1) + [gaussian_taps(sigma / math.sqrt(2.0), reach)])
     gain, colors = np.zeros_like(values[:, 0]), np.empty_like(values[:, 1:])
     arguments = values, marks, taps.astype(values.dtype), gain, colors
-    run_tasks(lambda tasks, counters: _evaluate(*arguments, tasks, counters), ranges(batch * height, _ROWS))
+    run_tasks(lambda tasks, counters: _fill_gains(*arguments, tasks, counters), ranges(batch * height, _ROWS))
     return torch.from_numpy(gain).to(planes.device), torch.from_numpy(colors).to(planes.device)
 
 
 @program.entry
-def _evaluate(planes, labels, taps, gain, colors, tasks, counters):
+def _fill_gains(planes, labels, taps, gain, colors, tasks, counters):
     """Fill ranges of rows, numbered across all images; each plane has its own taps."""
     _, count, height, width = planes.shape
     reach, is_mapped = taps.shape[1] - 1, len(labels) > 0

@@ -45,27 +45,25 @@ class SplatInputs(NamedTuple):
 
 
 class Kernel(NamedTuple):
-    """A kernel: three functions that record no graph, and abilities that only some kernels have.
-
-    plan: takes the inputs; returns which Gaussians touch which pixels, in the kernel's own format.
-    render: takes (plan, inputs); returns the image, (B, C, H, W).
-    differentiate: takes (plan, inputs, gradient of the image, geometry); returns the gradients of means, cholesky and
-        colors; the first two are None unless `geometry`.
-    image: takes the inputs; returns the image with a graph of all orders. None: the kernel is differentiable once.
-    error_gradients: takes (plan, inputs, target); returns the gradients of half the squared error against the target,
-        (B, C, H, W), in one pass. None: the kernel has no such pass.
-    checks_values: `plan` returns None if, and only if, a value is not finite or beyond the limits in whitened.py.
-        False: the caller has checked the values.
-    takes_one_image: Gaussians of one image may come without B; the results then have no B either. False: B is there.
-    looks_up_regions: the kernel takes `region_ids`, and looks up their positions. `plan` returns None for negative
-        ids, too; its `foreign` is the number of Gaussians whose id the map does not hold.
-    """
+    """A kernel: three functions that record no graph, and abilities that only some kernels have."""
 
     plan: Callable[[SplatInputs], Any]
+    """Takes the inputs; returns which Gaussians touch which pixels, in the kernel's own format."""
     render: Callable[[Any, SplatInputs], Tensor]
+    """Takes (plan, inputs); returns the image, (B, C, H, W)."""
     differentiate: Callable[[Any, SplatInputs, Tensor, bool], Gradients]
+    """Takes (plan, inputs, gradient of the image, geometry); returns the gradients of means, cholesky and colors. The
+    first two are None unless `geometry`."""
     image: Callable[[SplatInputs], Tensor] | None = None
+    """Takes the inputs; returns the image with a graph of all orders. None: the kernel is differentiable once."""
     error_gradients: Callable[[Any, SplatInputs, Tensor], Gradients] | None = None
+    """Takes (plan, inputs, target); returns the gradients of half the squared error against the target, (B, C, H, W),
+    in one pass. None: the kernel has no such pass."""
     checks_values: bool = False
+    """`plan` returns None if, and only if, a value is not finite or beyond the limits in whitened.py. False: the caller
+    has checked the values."""
     takes_one_image: bool = False
+    """Gaussians of one image may come without B; the results then have no B either. False: B is there."""
     looks_up_regions: bool = False
+    """The kernel takes `region_ids`, and looks up their positions. `plan` returns None for negative ids, too; its
+    `foreign` is the number of Gaussians whose id the map does not hold."""

@@ -11,7 +11,7 @@ from kcgs.compiled.workspace import Workspace
 
 @pytest.fixture(autouse=True)
 def empty_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workspace, "_thread", workspace.Thread())
+    monkeypatch.setattr(workspace, "_kept", workspace._Kept())
 
 
 def address_of(array: np.ndarray) -> int:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kcgs import RegionMap, fit
 from kcgs.fitting import propose_gaussians
-from kcgs.fitting.pursuit import _average, _evaluate, _scales, propose
+from kcgs.fitting.pursuit import _average, _gains, _scales, propose
 from kcgs.functional import lookup_regions, region_splat
 from kcgs.nn import GaussianField
 
@@ -100,7 +100,7 @@ class TestGain:
         generator = torch.Generator().manual_seed(0)
         planes = torch.rand(2, 4, *size, generator=generator).to(dtype)
         labels = torch.randint(0, 2, (2, *size), generator=generator).to(dtype)
-        actual = _evaluate(planes, labels if has_labels else None, 1.3)
+        actual = _gains(planes, labels if has_labels else None, 1.3)
         for k in range(2):
             expected = dense_filter(planes[k].double(), labels[k] if has_labels else torch.zeros(size), 1.3)
             torch.testing.assert_close([values[k] for values in actual], [values.to(dtype) for values in expected])

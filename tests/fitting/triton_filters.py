@@ -19,6 +19,6 @@ def test_filters_as_compiled_loops(size: tuple[int, int], num_maps: int, monkeyp
     pair = []
     for is_taken in (False, True):
         monkeypatch.setattr(pursuit, "takes_triton", lambda *tensors: is_taken)  # noqa: B023
-        pair.append(torch.cat([part.view(-1, *size) for part in pursuit._evaluate(planes, labels, 1.3)]))
+        pair.append(torch.cat([part.view(-1, *size) for part in pursuit._gains(planes, labels, 1.3)]))
     torch.testing.assert_close(*pair)
     assert not torch.equal(pair[0][0], pair[0][1])

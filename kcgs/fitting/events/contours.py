@@ -32,7 +32,7 @@ def adapt_contours(state: FitState) -> None:
     """Move the contours before some additions of Gaussians; choose their softness again if the settings ask for it."""
     if state.num_additions % _ADDITIONS_PER_MOVE:
         return
-    _move_contours(state, _MAX_RISE)
+    _move_contours_of_all(state, _MAX_RISE)
     if state.regions is not None and state.num_additions % _ADDITIONS_PER_SOFTNESS == _ADDITIONS_PER_MOVE:
         _replace_maps(state, _choose_softness)
 
@@ -52,7 +52,7 @@ def _choose_softness(state: FitState, image: int, regions: RegionMap) -> RegionM
     return with_chosen_softness(problem.target[image], regions) if problem.chooses_softness(image) else regions
 
 
-def _move_contours(state: FitState, max_rise: float) -> None:
+def _move_contours_of_all(state: FitState, max_rise: float) -> None:
     """Move the contours where this raises the squared error around them at most by the factor `max_rise`."""
     images, anchor, config = state.problem.image, state.anchor, state.problem.config
     if state.regions is None or anchor is None or images is None or not _has_time(state):
@@ -93,4 +93,4 @@ class SettleContours:
         due = self.after + (1 - self.after) * move / (self.num_moves + 1)
         if move <= self.num_moves and state.progress >= due:
             state.num_late_moves = move
-            _move_contours(state, max_rise=1.0)
+            _move_contours_of_all(state, max_rise=1.0)

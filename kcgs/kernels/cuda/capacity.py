@@ -48,7 +48,7 @@ def reserve(inputs: SplatInputs) -> int | None:
     captured = inputs.means.is_cuda and torch.cuda.is_current_stream_capturing()
     if _waits.get() and not captured:
         return None
-    most = _max_slots.get(_key(inputs))
+    most = _max_slots.get((inputs.means.device, inputs.num_images, inputs.size))
     if captured and most is None:
         images, (height, width) = inputs.num_images, inputs.size
         raise RuntimeError(
@@ -60,8 +60,7 @@ def reserve(inputs: SplatInputs) -> int | None:
 
 def remember(inputs: SplatInputs, slots: int) -> None:
     """Make room, from now on, for plans of so many slots."""
-    key = _key(inputs)
-    _max_slots[key] = max(slots, _max_slots.get(key, 0))
+    _raise_room((inputs.means.device, inputs.num_images, inputs.size), slots)
 
 
 @contextmanager
@@ -106,8 +105,7 @@ def settle(device: torch.device, num_images: int, size: tuple[int, int]) -> bool
         return False
     full, not_finite, most = notes.tolist()
     notes.zero_()
-    key = device, num_images, size
-    _max_slots[key] = max(most, _max_slots.get(key, 0))
+    _raise_room((device, num_images, size), most)
     return bool(full or not_finite)
 
 
@@ -120,5 +118,5 @@ def notes_of(device: torch.device) -> Tensor:
     return _notes[key]
 
 
-def _key(inputs: SplatInputs) -> tuple[torch.device, int, tuple[int, int]]:
-    return inputs.means.device, inputs.num_images, inputs.size
+def _raise_room(key: tuple[torch.device, int, tuple[int, int]], slots: int) -> None:
+    _max_slots[key] = max(slots, _max_slots.get(key, 0))
