@@ -79,35 +79,37 @@ def run_experiment(
     and the same command goes on.
     """
     if not options.redraw:
-        all_jobs = jobs(options)
-        selection = [
-            job for job in all_jobs if not options.only or {job["image"], job.get("comparison")} & {*options.only}
-        ]
-        if not selection:
-            raise ValueError(f"only must name some of {', '.join({job['image']: 0 for job in all_jobs})}")
-        options.output.mkdir(parents=True, exist_ok=True)
-        paths = {_path(options.output / "runs", measure, job): job for job in selection}
-        try:
-            _measure_missing(measure, paths, options.workers)
-        finally:
-            finished_paths = [path for path in paths if path.is_file()]
-            write_rows(
-                options.output / RESULTS_FILE, [row for path in finished_paths for row in json.loads(path.read_text())]
-            )
-            note = (
-                f"Stopped: {len(finished_paths)} of {len(paths)} jobs are done."
-                if len(finished_paths) < len(paths)
-                else ""
-            )
-            run = {"command": _command(name, options), "quick": options.quick, "tree": _tree(), "machine": _machine()}
-            run["note"] = note
-            (options.output / RUN_FILE).write_text(json.dumps(run, indent=1) + "\n", encoding="utf-8")
-    run = json.loads((options.output / RUN_FILE).read_text(encoding="utf-8"))
-    report = page(options.output, read_rows(options.output / RESULTS_FILE))
+        _measure_all(name, options, jobs(options), measure)
+    _write_report(options.output, page)
+
+
+def _measure_all(name: str, options: Options, jobs: list[Job], measure: Measure) -> None:
+    """Measure the jobs without a result, and write the rows of all that are done, also after an interruption."""
+    selection = [job for job in jobs if not options.only or {job["image"], job.get("comparison")} & {*options.only}]
+    if not selection:
+        raise ValueError(f"only must name some of {', '.join({job['image']: 0 for job in jobs})}")
+    options.output.mkdir(parents=True, exist_ok=True)
+    paths = {_path(options.output / "runs", measure, job): job for job in selection}
+    try:
+        _measure_missing(measure, paths, options.workers)
+    finally:
+        done = [path for path in paths if path.is_file()]
+        rows = [row for path in done for row in json.loads(path.read_text())]
+        write_rows(options.output / RESULTS_FILE, rows)
+        note = f"Stopped: {len(done)} of {len(paths)} jobs are done." if len(done) < len(paths) else ""
+        run = {"command": _command(name, options), "quick": options.quick, "tree": _tree(), "machine": _machine()}
+        run["note"] = note
+        (options.output / RUN_FILE).write_text(json.dumps(run, indent=1) + "\n", encoding="utf-8")
+
+
+def _write_report(folder: Path, page: Callable[[Path, list[Row]], Page]) -> None:
+    """Write report.md, and the differences with their intervals, from the results in a folder."""
+    run = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
+    report = page(folder, read_rows(folder / RESULTS_FILE))
     if report.differences:
-        write_rows(options.output / DIFFERENCES_FILE, report.differences)
+        write_rows(folder / DIFFERENCES_FILE, report.differences)
     question, _, _ = (_module_of(page).__doc__ or "").partition("\n")
-    (options.output / "report.md").write_text(_text(question, report, run), encoding="utf-8")
+    (folder / "report.md").write_text(_text(question, report, run), encoding="utf-8")
 
 
 def write_rows(path: Path, rows: Sequence[Row]) -> None:
