@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Literal, get_args
 
+from ._names_0_3 import OBJECTIVES, describe
 from .errors import InvalidArgument
 
 ObjectiveName = Literal["l2", "l1", "ms-ssim"]
@@ -16,19 +17,13 @@ PURPOSES: dict[Purpose, tuple[ObjectiveName, ...]] = {
     "file of a PSNR": ("l2", "ms-ssim"),
     "video": ("l2", "ms-ssim"),
 }
-# names of version 0.3, and what to write now
-_RENAMED = {
-    "psnr": "which is now 'l2'",
-    "auto": "which is now the default: leave it out",
-    "l1+ssim": "which is now in benchmarks/core/image_gs.py of the repository",
-}
 
 
 def check_objective(name: object) -> ObjectiveName | None:
     """Return the name of an objective, or None."""
     if name is None or name in NAMES:
         return name
-    received = f"{name!r}, {_RENAMED[name]}" if isinstance(name, str) and name in _RENAMED else repr(name)
+    received = describe(name, OBJECTIVES)
     if not isinstance(name, str):
         received = "a function, which only kcgs.fit takes" if callable(name) else type(name).__name__
     raise InvalidArgument("objective", f"one of {', '.join(NAMES)}", received)

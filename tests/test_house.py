@@ -35,7 +35,7 @@ LAYERS = [
     {"_labels"},
     {"_image"},
     {"_atomic", "_check", "_decode", "_memory", "_objectives", "_progress", "_repr", "_sizes", "_suffixes", "_warn"},
-    {"_arithmetic", "_numba_internals", "_rows", "_torch_internals", "errors"},
+    {"_arithmetic", "_names_0_3", "_numba_internals", "_rows", "_torch_internals", "errors"},
 ]
 # modules beside the `__init__` of a package that others import, two of a package at most: they load numba or Triton
 DOORS = {"kcgs.compiled.program", "kcgs.compiled.tasks", "kcgs.kernels.cuda.triton_function"}

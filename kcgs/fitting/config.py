@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
+from kcgs import _names_0_3
 from kcgs._objectives import ObjectiveName, Purpose, check_objective, objective_for
 from kcgs._repr import shorten
 from kcgs.errors import InvalidArgument, InvalidArgumentType
@@ -18,15 +19,6 @@ from kcgs.maps import MAX_SOFTNESS
 
 # iterations of a fit where neither `iterations` nor `max_seconds` is set
 _USUAL_ITERATIONS = 700
-# settings of version 0.3, and what replaces each
-_RENAMED = {
-    "loss": "it is objective now, with the same values",
-    "densify": "it is an argument of fit, an event of your own; None is matching pursuit, and 'largest-error' is in "
-    "benchmarks/core/image_gs.py of the repository",
-}
-_RENAMED_PROPERTIES = {"num_iterations": "planned_iterations", "max_iterations": "iteration_limit"}
-# values of version 0.3
-_VALUES_OF_IMAGE_GS = ("image-gs", "gradient", "adam")
 
 
 class FitConfig(BaseModel):
@@ -156,8 +148,8 @@ class FitConfig(BaseModel):
     if not TYPE_CHECKING:  # for a type checker, any name would exist
 
         def __getattr__(self, name: str) -> Any:
-            if name in _RENAMED_PROPERTIES:
-                raise AttributeError(f"{name} of a FitConfig is {_RENAMED_PROPERTIES[name]} now")
+            if name in _names_0_3.PROPERTIES:
+                raise AttributeError(f"{name} of a FitConfig is {_names_0_3.PROPERTIES[name]} now")
             return super().__getattr__(name)
 
     def __repr__(self) -> str:
@@ -181,7 +173,7 @@ class FitConfig(BaseModel):
         elif not isinstance(recipe, str):
             raise InvalidArgumentType("recipe", "a name or a FitConfig", type(recipe).__name__)
         elif recipe not in available_recipes():
-            raise InvalidArgument("recipe", f"one of {', '.join(available_recipes())}", _shown(recipe))
+            raise InvalidArgument("recipe", f"one of {', '.join(available_recipes())}", _names_0_3.describe(recipe))
         else:
             values = tomllib.loads((files("kcgs.recipes") / f"{recipe}.toml").read_text(encoding="utf-8"))
         return cls(**{**values, **settings})
@@ -209,18 +201,12 @@ def _first(error: ValidationError) -> Exception:
     detail = error.errors()[0]
     name = ".".join(map(str, detail["loc"][:1]))  # without the branches of a union
     if detail["type"] == "extra_forbidden":
-        if name in _RENAMED:
-            return ValueError(f"unknown setting {name!r}: {_RENAMED[name]}")
+        if name in _names_0_3.SETTINGS:
+            return ValueError(f"unknown setting {name!r}: {_names_0_3.SETTINGS[name]}")
         near = get_close_matches(name, FitConfig.model_fields, 1)
         hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(FitConfig.model_fields)}"
         return ValueError(f"unknown setting {name!r}: {hint}")
     if detail["type"] == "value_error":
         return cast(Exception, detail["ctx"]["error"])
     expected = detail["msg"].removeprefix("Input should be ")
-    return InvalidArgument(name, expected, _shown(detail["input"]))
-
-
-def _shown(value: object) -> str:
-    """Return the text of a value for a message; a value of Image-GS is followed by its new place."""
-    is_moved = isinstance(value, str) and value in _VALUES_OF_IMAGE_GS
-    return repr(value) + (", which is now in benchmarks/core/image_gs.py of the repository" if is_moved else "")
+    return InvalidArgument(name, expected, _names_0_3.describe(detail["input"]))
