@@ -83,9 +83,15 @@ def sums_to_gradients(sums: Tensor, channels: int, cholesky: Tensor) -> Gradient
     colors = sums[..., :channels]
     if sums.shape[-1] == channels:
         return None, None, colors
-    l11, l21, l22 = cholesky.double().unbind(-1)
-    s1, s2, s11, s12, s22 = sums[..., channels:].double().unbind(-1)
+    moments = sums[..., channels:].double().unbind(-1)
+    x, y, *factor = geometry_gradient(*moments, *cholesky.double().unbind(-1))
+    means, factors = (torch.stack(columns, -1).to(cholesky.dtype) for columns in ([x, y], factor))
+    return means, factors, colors
+
+
+def geometry_gradient(
+    s1: Numbers, s2: Numbers, s11: Numbers, s12: Numbers, s22: Numbers, l11: Numbers, l21: Numbers, l22: Numbers
+) -> tuple[Numbers, Numbers, Numbers, Numbers, Numbers]:
+    """Return the gradients of x, y, l11, l21 and l22, of the sums of v (z1, z2, z1 z1, z1 z2, z2 z2)."""
     slope = l21 / l22
-    means = torch.stack([(s1 - slope * s2) / l11, s2 / l22], -1)
-    factors = torch.stack([(s11 - slope * s12) / l11, s12 / l22, s22 / l22], -1)
-    return means.to(cholesky.dtype), factors.to(cholesky.dtype), colors
+    return (s1 - slope * s2) / l11, s2 / l22, (s11 - slope * s12) / l11, s12 / l22, s22 / l22

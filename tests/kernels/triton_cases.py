@@ -26,6 +26,7 @@ needs_gpu = pytest.mark.skipif(not GPU, reason="a CUDA graph needs a GPU")
 if triton_function.is_interpreted():
     # it would patch the whole language anew at every call of a function; plain Python is a part of what calls it
     render.weigh = gather.weigh = render.weigh.fn
+    gather._geometry_gradient = gather.geometry_gradient
 
 
 def make_inputs(

@@ -8,7 +8,7 @@ import numpy as np
 
 from kcgs.compiled.program import inner
 
-from ..whitened import SCALE
+from ..whitened import SCALE, geometry_gradient
 from .layout import COLOR_FACTOR, L11, L21, L22, LEVEL
 
 
@@ -19,6 +19,9 @@ class Backward(NamedTuple):
     means_gradient: Any  # [N, 2] float32
     cholesky_gradient: Any  # [N, 3] float32
     colors_gradient: Any  # [N, C] float32
+
+
+_geometry_gradient = inner(geometry_gradient)
 
 
 @inner
@@ -47,9 +50,9 @@ def sum_terms(lists, backward, terms, begin, end):
         s1, s2 = t[channels] / SCALE, t[channels + 1] / SCALE
         s11, s12 = t[channels + 2] / (SCALE * SCALE), t[channels + 3] / (SCALE * SCALE)
         s22 = t[channels + 4] / (SCALE * SCALE)
-        slope = g[L21] / g[L22]
-        mean[0], mean[1] = (s1 - slope * s2) / g[L11], s2 / g[L22]
-        factor[0], factor[1], factor[2] = (s11 - slope * s12) / g[L11], s12 / g[L22], s22 / g[L22]
+        mean[0], mean[1], factor[0], factor[1], factor[2] = _geometry_gradient(
+            s1, s2, s11, s12, s22, g[L11], g[L21], g[L22]
+        )
         if g[LEVEL] > 0:
             _uncoarsen(g, backward.factors[n], mean, factor, by_factor)
         backward.means_gradient[n, 0], backward.means_gradient[n, 1] = mean[0], mean[1]

@@ -59,7 +59,7 @@ from .simd import (
 _LEAST = -126.0
 
 
-class _Rows:
+class _PairRows:
     """The arguments of a loop over rows, as LLVM values."""
 
     def __init__(self, context: Any, builder: Any, argument_types: Any, arguments: Any) -> None:
@@ -154,7 +154,7 @@ def add_rows(typing_context, pixels, origin, channels, pairs, number, shapes, co
     """Add a pair: pixels[row, c, :] += weight[row, :] * colors[c] for its rows."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        rows = _Rows(context, builder, signature.args, arguments)
+        rows = _PairRows(context, builder, signature.args, arguments)
 
         def emit(channels: Channels, masked: bool) -> None:
             with rows.each_half() as half, rows.each_row(half, masked) as (_, weight, pixels):
@@ -177,7 +177,7 @@ def gather_rows(
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        rows = _Rows(context, builder, signature.args, arguments)
+        rows = _PairRows(context, builder, signature.args, arguments)
         room = pointer(context, builder, signature.args[10], arguments[10], long(0))
         target = pointer(context, builder, signature.args[11], arguments[11], builder.mul(rows.terms, arguments[12]))
 

@@ -46,7 +46,7 @@ def order_tasks(counts: tuple[int, ...], batch: int, kind: int, num_blocks: int,
         num_gaussians: Gaussians whose terms are summed after all rows have gathered.
     """
     cleared = _ranges(CLEARS, num_blocks if len(counts) > 1 else 0, _CLEAR_SIZE)
-    rows = _Rows(batch, len(cleared))
+    rows = _RowTasks(batch, len(cleared))
     top = len(counts) - 1
     if kind & ADDS:
         for level in range(top, 0, -1):
@@ -62,7 +62,7 @@ def order_tasks(counts: tuple[int, ...], batch: int, kind: int, num_blocks: int,
     return np.array([[0, *row] for row in cleared] + rows.tasks + sums, np.int64).reshape(-1, 5)
 
 
-class _Rows:
+class _RowTasks:
     """Tasks of rows in their order, each with the number of tasks that must be done before it."""
 
     def __init__(self, batch: int, cleared: int) -> None:

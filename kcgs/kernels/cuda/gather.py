@@ -12,6 +12,7 @@ import triton.language as tl
 from torch import Tensor
 
 from ..interface import Gradients, SplatInputs
+from ..whitened import geometry_gradient
 from .capacity import room_for
 from .plan import PIECE, PIECES, SCALE, SIDE, CudaPlan, fails
 from .render import channels_at_once, lists_of, render, weigh
@@ -25,6 +26,8 @@ _UNROLL = tl.constexpr(2)
 _SLOTS = 64
 # columns of terms that it adds at once; the first of them hold the five moments
 _COLUMNS = 8
+
+_geometry_gradient = triton.jit(geometry_gradient)
 
 
 def differentiate(plan: CudaPlan, inputs: SplatInputs, grad: Tensor, geometry: bool) -> Gradients:
@@ -166,12 +169,12 @@ def _reduce(
             l11 = tl.load(cholesky + 3 * g).to(tl.float64)
             l21 = tl.load(cholesky + 3 * g + 1).to(tl.float64)
             l22 = tl.load(cholesky + 3 * g + 2).to(tl.float64)
-            slope = l21 / l22
-            tl.store(means_grad + 2 * g, ((s1 - slope * s2) / l11).to(tl.float32))
-            tl.store(means_grad + 2 * g + 1, (s2 / l22).to(tl.float32))
-            tl.store(cholesky_grad + 3 * g, ((s11 - slope * s12) / l11).to(tl.float32))
-            tl.store(cholesky_grad + 3 * g + 1, (s12 / l22).to(tl.float32))
-            tl.store(cholesky_grad + 3 * g + 2, (s22 / l22).to(tl.float32))
+            x, y, g11, g21, g22 = _geometry_gradient(s1, s2, s11, s12, s22, l11, l21, l22)
+            tl.store(means_grad + 2 * g, x.to(tl.float32))
+            tl.store(means_grad + 2 * g + 1, y.to(tl.float32))
+            tl.store(cholesky_grad + 3 * g, g11.to(tl.float32))
+            tl.store(cholesky_grad + 3 * g + 1, g21.to(tl.float32))
+            tl.store(cholesky_grad + 3 * g + 2, g22.to(tl.float32))
         channel = base + column - moments
         address = colors_grad + g.to(tl.int64) * channels + channel
         tl.store(address, sums.to(tl.float32), mask=(channel >= 0) & (channel < channels))
