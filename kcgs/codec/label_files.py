@@ -52,7 +52,7 @@ def encode_labels(labels: Tensor | NDArray[Any]) -> bytes:
     dtype = str(labels.dtype).removeprefix("torch.").replace("uint64", "int64")
     check_count("pixels per side of labels", max(checked.shape), 1, MAX_SIDE)
     check_count("pixels of labels", checked.numel(), 1, MAX_LABELS)
-    ids, index = (numbers.numpy() for numbers in compact(checked.cpu())[:2])
+    ids, index = (numbers.numpy() for numbers in compact(checked.cpu()))
     check_count("number of regions", len(ids), 1, MAX_REGIONS)
     turn, stream = _encode_smallest(ids, index)
     form = turn + _TURNS * _TYPES.index(dtype)

@@ -29,7 +29,7 @@ def encode_region_map(regions: RegionMap) -> bytes:
         raise InvalidArgument("regions", "a map of its own pixels", "one that was resized")
     check_count("number of labels", regions.labels.numel(), 1, MAX_LABELS)
     check_count("number of regions", regions.num_regions, 1, MAX_REGIONS)
-    ids, index = compact(regions.labels.cpu())[:2]
+    ids, index = compact(regions.labels.cpu())
     labels = encode_stream(ids.numpy(), index.numpy(), is_file=False)
     softness = regions.softness
     assert not isinstance(softness, tuple)  # of one map

@@ -118,7 +118,7 @@ class GaussianAdam(Optimizer):
             with torch.enable_grad():
                 loss = closure()
         check_gradients([parameter.grad for group in self.param_groups for parameter in group["params"]])
-        for geometry, colors in zip(self.param_groups[::2], self.param_groups[1::2], strict=True):
+        for geometry, colors in self._pairs():
             step_groups(self.state, geometry, colors)
         return loss
 
@@ -154,10 +154,10 @@ class GaussianAdam(Optimizer):
             received = {name: tuple(table.shape) for name, table in averages.items()}
             if received and received != expected:
                 raise InvalidArgument("state_dict", f"of {expected}", received)
-        sizes = [group["size"] for group in self.param_groups[::2]]
+        sizes = [geometry["size"] for geometry, _ in self._pairs()]
         super().load_state_dict(state_dict)
-        for group, size in zip(self.param_groups[::2], sizes, strict=True):
-            group["size"] = size  # of the field, not of the field that the state is of
+        for (geometry, _), size in zip(self._pairs(), sizes, strict=True):
+            geometry["size"] = size  # of the field, not of the field that the state is of
 
     @torch.no_grad()
     def append(self, field: GaussianField, added: GaussianField) -> None:
@@ -171,7 +171,7 @@ class GaussianAdam(Optimizer):
             ValueError: a field that the optimizer was not made for, or Gaussians that do not fit to it.
         """
         check_added(field, added)
-        geometry = self._group(field)
+        geometry, _ = self._groups(field)
         means, cholesky = within_bounds(added.means, added.cholesky, bounds_of(geometry))
         colors = added.colors.clamp(*COLOR_RANGE) if geometry["bounded"] else added.colors
         parts = {"means": means, "cholesky": cholesky, "colors": colors, "opacities": added.opacities}
@@ -196,7 +196,7 @@ class GaussianAdam(Optimizer):
             ValueError: a field that the optimizer was not made for; a mask of another type or shape, or of more
                 Gaussians in one image than in another.
         """
-        self._group(field)
+        self._groups(field)
         index, rows = rows_of(field, mask), field.means.ndim - 2
         for name in ("means", "cholesky", "colors", "opacities"):
             if (value := getattr(field, name)) is not None:
@@ -226,10 +226,9 @@ class GaussianAdam(Optimizer):
             >>> (field.colors != before).any(-1)
             tensor([False,  True,  True,  True])
         """
-        geometry = self._group(field)
+        groups = self._groups(field)
         check_mask(mask, field.means.shape[:-1])
-        colors = next(group for group in self.param_groups if group["params"][0] is field.colors)
-        for group in (geometry, colors):
+        for group in groups:
             state = self.state[group["params"][0]]
             init_state(state, group)
             state["age"].masked_fill_(mask[..., None], FROZEN)
@@ -239,11 +238,15 @@ class GaussianAdam(Optimizer):
         age = self.state[field.means].get("age")
         return torch.zeros_like(field.means[..., 0], dtype=torch.bool) if age is None else age[..., 0] < 0
 
-    def _group(self, field: GaussianField) -> dict[str, Any]:
-        """Return the group of a field's geometry; ValueError for a field that the optimizer was not made for."""
-        for group in self.param_groups:
-            if group["params"][0] is field.means:
-                return group
+    def _pairs(self) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
+        """Return the groups of each field: its geometry and its colours."""
+        return zip(self.param_groups[::2], self.param_groups[1::2], strict=True)
+
+    def _groups(self, field: GaussianField) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Return the groups of a field; ValueError for a field that the optimizer was not made for."""
+        for geometry, colors in self._pairs():
+            if geometry["params"][0] is field.means:
+                return geometry, colors
         raise InvalidArgument("field", "one that the optimizer was made for", "another")
 
     def _replace(self, field: GaussianField, name: str, rows: Tensor) -> None:

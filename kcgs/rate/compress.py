@@ -231,10 +231,10 @@ class Compressor:
 
     def write(self, qp: int) -> bytes:
         """Return the file at a QP."""
-        return self._write_gradually(self._descend(qp, lambda _, qp: qp)[0], qp, self.rounding_iterations)
+        return self._write_gradually(self._descend(qp)[0], qp, self.rounding_iterations)
 
-    def _descend(self, qp: int, update_qp: Callable[[SceneWriter, int], int]) -> tuple[SceneWriter, int]:
-        """Lower error and bits before rounding; `update_qp` returns the QP for the current scene.
+    def _descend(self, qp: int, update_qp: Callable[[SceneWriter, int], int] | None = None) -> tuple[SceneWriter, int]:
+        """Lower error and bits before rounding; `update_qp` returns the QP for the current scene, None keeps it.
 
         Returns:
             The Gaussians, and the last QP.
@@ -246,7 +246,8 @@ class Compressor:
             nonlocal writer, qp
             if descent.iteration:
                 writer = writer.with_gaussians(descent.parameters(), descent.ids)
-            qp = update_qp(writer, qp)
+            if update_qp is not None:
+                qp = update_qp(writer, qp)
             descent.quantizer = Quantizer(qp, writer.size)
             if descent.iteration >= _PRUNE_FROM * iterations:
                 descent.prune()
