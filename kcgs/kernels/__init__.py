@@ -27,10 +27,3 @@ from .whitened import (
     support_radius,
     whiten,
 )
-
-__all__ = [
-    "BACKENDS", "MEAN_LIMIT", "SCALE_LIMITS", "SCALE_TOLERANCE", "Z_LIMIT", "Blocks", "Coarsened", "Kernel",
-    "SplatInputs", "affine_coefficients", "bounding_tiles", "check_backend", "choose_levels", "coarsen", "find_keys",
-    "least_exponent", "least_whitened", "make_blocks", "max_spacing", "resolve", "settle", "support_radius",
-    "takes_triton", "warm_up", "whiten", "without_waiting",
-]  # fmt: skip
