@@ -110,8 +110,8 @@ def _recolor(scene: Scene, ids: list[int], gain: Numbers, bias: Numbers | None) 
 def _paint(scene: Scene, region_id: int, color: str | Numbers, strength: float) -> Scene:
     """Replace a share of a region's colours, `strength`, by the new colour times a linear function of their luma.
 
-    The function is top - contrast (brightest - luma), which is 1 at the luma `reference`. Where its largest value, `top`,
-    would clip the colour, `top` and the contrast are lowered.
+    The function is top - contrast (brightest - luma), which is 1 at the luma `reference`. Where its largest value,
+    `top`, would clip the colour, `top` and the contrast are lowered.
     """
     if scene.regions is None:
         raise InvalidArgument("scene", "a label map", "none", verb="have")
