@@ -19,5 +19,4 @@ VALUES = dict.fromkeys(("image-gs", "gradient", "adam"), f"which is now {_IMAGE_
 
 def describe(value: object, names: dict[str, str] = VALUES) -> str:
     """Return the text of a value for a message; a value of 0.3 is followed by what replaced it."""
-    is_old = isinstance(value, str) and value in names
-    return f"{value!r}, {names[value]}" if is_old else repr(value)
+    return f"{value!r}, {names[value]}" if isinstance(value, str) and value in names else repr(value)

@@ -14,6 +14,7 @@ from torch import Tensor
 from kcgs._arithmetic import Numbers
 
 from .interface import Gradients
+from .moments import geometry_gradient
 
 # if z is multiplied by this, the weight exp(-|z|^2 / 2) is 2^(-|z|^2)
 SCALE = math.sqrt(0.5 / math.log(2.0))
@@ -84,14 +85,6 @@ def sums_to_gradients(sums: Tensor, channels: int, cholesky: Tensor) -> Gradient
     if sums.shape[-1] == channels:
         return None, None, colors
     moments = sums[..., channels:].double().unbind(-1)
-    x, y, *factor = geometry_gradient(*moments, *cholesky.double().unbind(-1))
+    x, y, *factor = geometry_gradient(*moments, *cholesky.double().unbind(-1))  # type: ignore[no-untyped-call]
     means, factors = (torch.stack(columns, -1).to(cholesky.dtype) for columns in ([x, y], factor))
     return means, factors, colors
-
-
-def geometry_gradient(
-    s1: Numbers, s2: Numbers, s11: Numbers, s12: Numbers, s22: Numbers, l11: Numbers, l21: Numbers, l22: Numbers
-) -> tuple[Numbers, Numbers, Numbers, Numbers, Numbers]:
-    """Return the gradients of x, y, l11, l21 and l22, of the sums of v (z1, z2, z1 z1, z1 z2, z2 z2)."""
-    slope = l21 / l22
-    return (s1 - slope * s2) / l11, s2 / l22, (s11 - slope * s12) / l11, s12 / l22, s22 / l22

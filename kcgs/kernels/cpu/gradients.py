@@ -8,7 +8,8 @@ import numpy as np
 
 from kcgs.compiled.program import inner
 
-from ..whitened import SCALE, geometry_gradient
+from ..moments import geometry_gradient
+from ..whitened import SCALE
 from .layout import COLOR_FACTOR, L11, L21, L22, LEVEL
 
 

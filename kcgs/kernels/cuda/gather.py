@@ -12,7 +12,7 @@ import triton.language as tl
 from torch import Tensor
 
 from ..interface import Gradients, SplatInputs
-from ..whitened import geometry_gradient
+from ..moments import geometry_gradient
 from .capacity import room_for
 from .plan import PIECE, PIECES, SCALE, SIDE, CudaPlan, fails
 from .render import channels_at_once, lists_of, render, weigh
