@@ -33,7 +33,7 @@ def prepare(arguments: SplatArguments, check: bool = True) -> Execution:
     plan = kernel.plan(inputs)
     if plan is None:
         _refuse(arguments, inputs)
-    if check and kernel.looks_up_regions and plan.foreign:
+    if check and kernel.looks_up_regions and plan.num_unknown_ids:
         _check_ids(inputs)
     return Execution(kernel, inputs, plan)
 

@@ -66,4 +66,4 @@ class Kernel(NamedTuple):
     """Gaussians of one image may come without B; the results then have no B either. False: B is there."""
     looks_up_regions: bool = False
     """The kernel takes `region_ids`, and looks up their positions. `plan` returns None for negative ids, too; its
-    `foreign` is the number of Gaussians whose id the map does not hold."""
+    `num_unknown_ids` is the number of Gaussians whose id the map does not hold."""

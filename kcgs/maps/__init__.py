@@ -5,7 +5,7 @@ Users have the public names from `kcgs.functional`.
 
 from .antialiasing import antialias
 from .arguments import as_region_map, table_and_size
-from .derived import derive, membership_at, table_at
+from .derived import cached_for, membership_at, table_at
 from .interior import interior_points
 from .labels import (
     compact,

@@ -27,7 +27,7 @@ _KEPT_SIZES = 3  # per map: a viewer renders at ever new sizes
 _derived: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
 
 
-def derive(table: MapTable, make: Callable[[MapTable], T]) -> T:
+def cached_for(table: MapTable, make: Callable[[MapTable], T]) -> T:
     """Return make(table); the function is called once per table that has `starts`."""
     if table.starts is None:
         return make(table)
@@ -46,7 +46,7 @@ def _resampler(table: MapTable) -> Callable[[tuple[int, int]], Resampled]:
 def membership_at(table: MapTable, size: tuple[int, int]) -> Membership:
     """Return the membership of a map at a size, by its definition."""
     table = with_positions(table)
-    return Membership(table) if size == table.size else derive(table, _resampler)(size)
+    return Membership(table) if size == table.size else cached_for(table, _resampler)(size)
 
 
 def table_at(table: MapTable, size: tuple[int, int]) -> MapTable:

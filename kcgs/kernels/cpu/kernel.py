@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kcgs.compiled import Workspace, borrowed
 from kcgs.compiled.tasks import chunks, phases, run_tasks
-from kcgs.maps import MapTable, derive, table_at
+from kcgs.maps import MapTable, cached_for, table_at
 
 from ..coarse_grids import make_blocks, max_spacing
 from ..grid_columns import TILE_COLS, TILE_ROWS
@@ -57,7 +57,7 @@ def plan(inputs: SplatInputs) -> CpuPlan | None:
     """List which Gaussians touch which blocks; None where a value is out of range."""
     means, cholesky, colors = (_array(t) for t in inputs.gaussians)
     if inputs.table is not None and inputs.region_positions is not None:
-        table = derive(table_at(inputs.table, inputs.size), _table_of)
+        table = cached_for(table_at(inputs.table, inputs.size), _table_of)
         regions = inputs.region_positions.flatten().numpy()
     else:
         table, regions = _table_without_map(inputs.size), np.empty(0, np.int64)

@@ -48,7 +48,7 @@ _MOST_SCALE = tl.constexpr(SCALE_LIMITS[1])
 # places in CudaPlan.counters, int64
 SLOTS = tl.constexpr(0)  # tiles of all boxes
 INVALID = tl.constexpr(1)  # Gaussians whose values are not finite or out of range, or whose region id is negative
-_FOREIGN = tl.constexpr(2)  # Gaussians whose region id the map does not hold
+_UNKNOWN_IDS = tl.constexpr(2)  # Gaussians whose region id the map does not hold
 _ENTRIES = tl.constexpr(3)  # entries of the cells' lists
 _PAIRS = tl.constexpr(4)  # places of the tiles' lists
 PIECES = tl.constexpr(5)
@@ -68,7 +68,7 @@ class CudaPlan(NamedTuple):
     weights: Tensor | None  # of the map's tiles
     grid: TileGrid
     num_cells: int
-    foreign: int  # Gaussians whose region id the map does not hold, where the plan waited for the device
+    num_unknown_ids: int  # Gaussians whose region id the map does not hold, where the plan waited for the device
 
     @property
     def room(self) -> int:
@@ -85,7 +85,8 @@ def plan(inputs: SplatInputs) -> CudaPlan | None:
     if max(grid.rows, grid.cols) > _MOST_TILES:
         raise InvalidArgument("size", f"at most {_MOST_TILES * TILE} on backend 'cuda'", inputs.size)
     num_cells, total = grid.batch * cell_rows * cell_cols, grid.batch * count
-    radius, room, foreign, notes = support_radius(inputs.cutoff, means.dtype), reserve(inputs), 0, notes_of(device)
+    radius, notes, num_unknown_ids = support_radius(inputs.cutoff, means.dtype), notes_of(device), 0
+    room = reserve(inputs)
     waits = room is None
     counters = torch.zeros(_COUNTERS, dtype=torch.int64, device=device)
     gaussians = torch.empty(4, total, dtype=torch.int32, device=device)
@@ -101,7 +102,7 @@ def plan(inputs: SplatInputs) -> CudaPlan | None:
             NOTES=waits and reports(), BLOCK=_PREPARE_BLOCK,
         )  # fmt: skip
         if room is None:
-            room, invalid, foreign, _, _, _, *noted = counters.tolist()
+            room, invalid, num_unknown_ids, _, _, _, *noted = counters.tolist()
             report(*noted)
             if invalid:
                 return None
@@ -122,7 +123,7 @@ def plan(inputs: SplatInputs) -> CudaPlan | None:
             map_tiles, total, room, num_cells, grid.total, grid.rows, grid.cols, cell_rows, cell_cols, pieces.shape[1],
             radius, MAPPED=num_ids > 0, BLOCK=_TILE_BLOCK,
         )  # fmt: skip
-    return CudaPlan(counters, gaussians, lists, slots, coefficients, pieces, weights, grid, num_cells, foreign)
+    return CudaPlan(counters, gaussians, lists, slots, coefficients, pieces, weights, grid, num_cells, num_unknown_ids)
 
 
 @triton_function(warps=4)
@@ -160,8 +161,8 @@ def _prepare(
             region = tl.where(smaller, after, region)
         known &= tl.load(ids + region, mask=region < num_ids, other=-1) == region_id
         tl.store(gaussians + 3 * total + g, region, mask=present)
-        foreign = tl.sum((present & ~known).to(tl.int32), axis=0)
-        tl.atomic_add(counters + _FOREIGN, foreign.to(tl.int64), mask=foreign > 0)
+        num_unknown_ids = tl.sum((present & ~known).to(tl.int32), axis=0)
+        tl.atomic_add(counters + _UNKNOWN_IDS, num_unknown_ids.to(tl.int64), mask=num_unknown_ids > 0)
     invalid = tl.sum((present & ~valid).to(tl.int32), axis=0)
     tl.atomic_add(counters + INVALID, invalid.to(tl.int64), mask=invalid > 0)
 
