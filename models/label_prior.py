@@ -129,9 +129,9 @@ def train(maps: list[Any], steps: int, seed: int, units: tuple[int, int] = (48, 
         for turned in (labels, labels[::-1], labels[:, ::-1], labels.T):
             features, classes = examples(np.ascontiguousarray(turned))
             index = generator.permutation(len(classes))[:PER_MAP]
-            has_escapes = np.full(len(index), len(np.unique(labels)) > 2)
-            samples.append((features[index], classes[index], has_escapes))
-    features, classes, has_escapes = (torch.from_numpy(np.concatenate(parts)) for parts in zip(*samples, strict=True))
+            has_neither = np.full(len(index), len(np.unique(labels)) > 2)
+            samples.append((features[index], classes[index], has_neither))
+    features, classes, has_neither = (torch.from_numpy(np.concatenate(parts)) for parts in zip(*samples, strict=True))
     print(f"{len(classes)} examples", file=sys.stderr)
     sizes = [2 * len(TEMPLATE), *units, 2]
     parameters = [torch.randn(a, b) * a**-0.5 for a, b in pairwise(sizes)]
@@ -145,7 +145,7 @@ def train(maps: list[Any], steps: int, seed: int, units: tuple[int, int] = (48, 
         losses = torch.nn.functional.binary_cross_entropy_with_logits(
             logits, torch.stack([(target == 1).float(), (target == 2).float()], 1), reduction="none"
         )
-        loss = (losses[:, 0] * (target < 2) + losses[:, 1] * has_escapes[batch]).mean()
+        loss = (losses[:, 0] * (target < 2) + losses[:, 1] * has_neither[batch]).mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

@@ -25,6 +25,20 @@ class Axis:
     same side in every runtime, without float64, which some runtimes lack. If output pixels are larger than pixels of
     the scene, more pixels are rendered first: as many as the scene has in this part, but at most twice the pixels of
     the whole scene; `shrink` then averages them.
+
+    Attributes:
+        size: rendered pixels, (1,).
+        parts: unit of `local`: parts per pixel of the scene, (1,).
+        step: pixels of the scene per rendered pixel, (1,) float32.
+        tile: consecutive tiles, one for each of the V runs, (V,); a constant if the whole scene is rendered.
+        runs: pixels of each run, (V,).
+        pieces: blocks of a run, (1,).
+        side: pixels of a block, (1,).
+        is_aligned: rendered pixels have the size and the places of the scene's pixels, (1,) bool.
+        is_native: `is_aligned`, and each tile is one block from 0 on, (1,) bool.
+        local: pixel centres relative to the corner of their tile, (V, pieces, side).
+        steps: pixel centres relative to the middle of a block, where polynomials have least rounding, (side,).
+        origins: middles of blocks relative to the centre of their tile, (V, pieces).
     """
 
     def __init__(self, g: Graph, output: Value, length: int, ends: tuple[Value, Value] | None = None) -> None:
@@ -33,41 +47,44 @@ class Axis:
         self.output = output
         self.length = length
         start, extent = _bounds(g, length, ends)
+        self._set_scale(extent)
+        shift = self.size * 2 * start
+        self.tile = self._tiles(shift, extent, is_whole=ends is None)
+        corner = self.tile * TILE * self.parts
+        begin = self._set_runs(corner - shift, extent)
+        self.is_aligned = g.And(g.Equal(start % _PARTS, 0), g.Equal(extent, self.size * _PARTS))
+        self.is_native = g.And(g.And(g.Equal(start, 0), self.is_aligned), g.Equal(self.side, TILE))
+        self._set_places(begin, corner, shift, extent)
+
+    def _set_scale(self, extent: Value) -> None:
+        g = self.graph
         # rounded up, with a tolerance for the rounding of the ends; a view far beyond the scene needs no more pixels
         pixels = (extent + (_PARTS - 1 - _PARTS // 256)) // _PARTS
-        # rendered pixels, (1,)
-        self.size = g.Max(output, g.Min(pixels, 2 * length))
-        # unit of `local`, (1,): parts per pixel of the scene
+        self.size = g.Max(self.output, g.Min(pixels, 2 * self.length))
         self.parts = self.size * (2 * _PARTS)
-        # pixels of the scene per rendered pixel, (1,) float32
         self.step = extent.astype(FLOAT) / (self.size * _PARTS).astype(FLOAT)
-        shift = self.size * 2 * start
-        # consecutive tiles with a run, (V,); a constant if the whole scene is rendered
-        self.tile = self._tiles(shift, extent, is_whole=ends is None)
 
-        corner = self.tile * TILE * self.parts
+    def _set_runs(self, corner: Value, extent: Value) -> Value:
+        """Cut the pixels into runs, and these into blocks; return the first pixel of each run, (V,)."""
+        g = self.graph
         # a run begins at the first pixel whose centre is not left of the corner; pixels left of the scene are tile 0's
-        begin = g.Max((corner - shift + extent - 1) // (extent * 2), 0) * g.Min(self.tile, 1)
+        begin = g.Max((corner + extent - 1) // (extent * 2), 0) * g.Min(self.tile, 1)
         end = g.Concat(g.Slice(begin, [1], [1 << 30], [0]), self.size, axis=0)
-        # pixels of each run, (V,); blocks of a run, (1,); pixels of a block, (1,)
         self.runs = end - begin
         longest = g.ReduceMax(self.runs, keepdims=1)
         self.pieces = (longest + (TILE - 1)) // TILE
         self.side = (longest + (self.pieces - 1)) // self.pieces
-        # (1,) bool: pixels have the size and the places of the scene's pixels; also, each tile is one block from 0 on
-        self.is_aligned = g.And(g.Equal(start % _PARTS, 0), g.Equal(extent, self.size * _PARTS))
-        self.is_native = g.And(g.And(g.Equal(start, 0), self.is_aligned), g.Equal(self.side, TILE))
+        return begin
 
+    def _set_places(self, begin: Value, corner: Value, shift: Value, extent: Value) -> None:
+        g = self.graph
         within = g.Range(0, g.Squeeze(self.pieces * self.side), 1)
         within = g.Reshape(within, g.Concat([1], self.pieces, self.side, axis=0))
         axes = g.constant([1, 2])
         pixel = g.Unsqueeze(begin, axes) + within
-        # pixel centres relative to the corner of their tile, in parts, (V, pieces, side)
         self.local = (pixel * 2 + 1) * extent + (shift - g.Unsqueeze(corner, axes))
         middle = (self.side - 1).astype(FLOAT) * 0.5
-        # pixel centres relative to the middle of a block, where polynomials have least rounding, (side,)
         self.steps = (g.Range(0, g.Squeeze(self.side), 1).astype(FLOAT) - middle) * self.step
-        # middles of blocks relative to the centre of their tile, (V, pieces)
         firsts = g.Gather(self.local, 0, axis=2).astype(FLOAT) / self.parts.astype(FLOAT)
         self.origins = firsts + (middle * self.step - TILE / 2)
 

@@ -118,9 +118,7 @@ class Cleanup:
     def _clean(self, image: Tensor, regions: Labels) -> Labels:
         if self.snap:
             regions = snap_contours(rgb_to_lab(image), regions, self.snap)
-        regions = merge_small(regions, self.min_pixels(regions.size))
-        # connect after merging: a merged piece can join the two pieces of a region on its sides
-        regions = order_by_area(connect(regions) if self.connected else regions)
+        regions = clean(regions, self.min_pixels(regions.size), connected=self.connected)
         return order_by_area(merge_similar(image, regions, self.max_regions))
 
 
@@ -185,14 +183,16 @@ def merge_similar(image: Tensor, regions: Labels, max_regions: int | None, objec
     return graph.roots()[regions]
 
 
-def clean(labels: Labels, min_size: int, objects: Labels | None = None) -> Labels:
-    """Return 4-connected regions of at least ``min_size`` pixels, by decreasing area.
+def clean(labels: Labels, min_size: int, objects: Labels | None = None, *, connected: bool = True) -> Labels:
+    """Return regions whose 4-connected pieces have at least ``min_size`` pixels, by decreasing area.
 
-    With objects, regions are first divided along the contours of objects.
+    With objects, regions are first divided along the contours of objects. Connected: each piece is a region.
     """
     if objects is not None:
         labels = labels * (int(objects.max()) + 1) + objects
-    return order_by_area(connect(merge_small(labels, min_size, objects)))
+    labels = merge_small(labels, min_size, objects)
+    # connect after merging: a merged piece can join the two pieces of a region on its sides
+    return order_by_area(connect(labels) if connected else labels)
 
 
 def _region_means(regions: Labels, scores: NDArray[np.float64]) -> Tensor:

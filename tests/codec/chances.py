@@ -105,4 +105,4 @@ class Pixel:
         logits = models[0].prior.logits(f)
         keys = [tuple(value > 0 for value in f[1 : 1 + nearest]) for nearest in (6, 11, 16)]
         self.is_second = Decision(models[0], logits[0], keys)
-        self.is_escape = Decision(models[1], logits[1], [(), tuple(f[1:5]), tuple(f[1:9])])
+        self.is_neither = Decision(models[1], logits[1], [(), tuple(f[1:5]), tuple(f[1:9])])

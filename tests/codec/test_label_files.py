@@ -88,7 +88,7 @@ class TestEncodeLabels:
         order = np.random.RandomState(0).permutation(9)
         assert len(encode_labels(order[labels])) <= len(encode_labels(labels)) + 9
 
-    @pytest.mark.parametrize("limit", ["MAX_CODED", "MAX_ESCAPES"])
+    @pytest.mark.parametrize("limit", ["MAX_CODED", "MAX_EXPLICIT"])
     def test_work_is_bounded(self, limit: str, monkeypatch: pytest.MonkeyPatch) -> None:
         """A map that takes too long to decode is written as noise, and refused where it is not."""
         specks = np.random.default_rng(0).random((80, 120))

@@ -90,19 +90,19 @@ class Map:
                 self.rows[y][x] = 1 - neighbours.pop()
             else:
                 unknown[x, y] = [*neighbours]
-        has_escapes = self.regions > 2
-        is_escape = {at: self.bits.bit(pixel.is_escape.p) if has_escapes else 0 for at, pixel in coded.items()}
+        has_neither = self.regions > 2
+        is_neither = {at: self.bits.bit(pixel.is_neither.p) if has_neither else 0 for at, pixel in coded.items()}
         is_second = {at: self.bits.bit(pixel.is_second.p) for at, pixel in coded.items()}
         for (x, y), candidates in unknown.items():
             at = (x, y)
-            if at in coded and not is_escape[at]:
+            if at in coded and not is_neither[at]:
                 self.rows[y][x] = coded[at].candidates[is_second[at]]
             else:
                 self.rows[y][x] = self.read_label(x, y, candidates or coded[at].candidates, at not in coded)
         for at, pixel in coded.items():
-            if has_escapes:
-                pixel.is_escape.learn(is_escape[at])
-            if is_escape[at]:
+            if has_neither:
+                pixel.is_neither.learn(is_neither[at])
+            if is_neither[at]:
                 assert is_second[at]
             else:
                 pixel.is_second.learn(is_second[at])

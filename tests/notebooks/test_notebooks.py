@@ -113,7 +113,7 @@ class TestCommitted:
                 cell.source
             )
             assert ("display_data" in output_types) == bool(
-                re.search(r"^(show\(|\w.*= plt\.subplots\()", cell.source, re.MULTILINE)
+                re.search(r"^(show(_rows)?\(|\w.*= plt\.subplots\()", cell.source, re.MULTILINE)
             ), cell.source
         assert_clean(notebook)
         assert_prints(name, notebook)

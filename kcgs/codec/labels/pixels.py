@@ -15,7 +15,7 @@ from .wavefront import MAX_NEAREST, Scan, advance, find_nearest, new_scan
 
 # limits that keep the work of a decoder to seconds
 MAX_CODED = 1 << 23  # pixels decided by bits
-MAX_ESCAPES = 1 << 18  # labels of seeds, and of pixels that have neither candidate
+MAX_EXPLICIT = 1 << 18  # explicit labels
 
 
 class WorkLimitError(CodecError):
@@ -35,7 +35,7 @@ def code_pixels(coder: Coder, truth: Any, seeds: Any, num_regions: int, *, is_fi
     code_seeds(coder, seeds)
     height, width = seeds.shape
     scan = new_scan(seeds, num_regions, is_file=is_file)
-    escapes = _Escapes(coder, scan, num_regions)
+    explicit_labels = _ExplicitLabels(coder, scan, num_regions)
     bits, total = scan.answers[:0], 0
     while num_pixels := advance(scan, bits, truth):
         num_coded = int(scan.state["num_coded"])
@@ -46,11 +46,11 @@ def code_pixels(coder: Coder, truth: Any, seeds: Any, num_regions: int, *, is_fi
         if num_bits:
             bits = coder.bits(scan.chances[:num_bits], scan.answers[:num_bits])
         if num_regions > 2 and (num_pixels > num_coded or np.count_nonzero(bits[:num_coded])):
-            escapes.code(scan.pixels[:num_pixels], bits[:num_coded] != 0)
+            explicit_labels.code(scan.pixels[:num_pixels], bits[:num_coded] != 0)
     return scan.labels[TOP : TOP + height, LEFT : LEFT + width]
 
 
-class _Escapes:
+class _ExplicitLabels:
     """Code labels of seeds, and of pixels that have neither candidate, in maps of three regions or more."""
 
     def __init__(self, coder: Coder, scan: Scan, num_regions: int) -> None:
@@ -61,14 +61,14 @@ class _Escapes:
         self._is_new = [AdaptiveBit(), AdaptiveBit()]
         self._is_nearest = [[AdaptiveBit() for _ in range(MAX_NEAREST)] for _ in range(2)]
 
-    def code(self, pixels: Any, has_neither: Any) -> None:
-        """Code the labels of a wavefront's escapes; `has_neither` marks the coded pixels with neither candidate."""
-        is_escape = pixels["is_coded"] == 0
-        is_escape[~is_escape] = has_neither
-        self._count += int(is_escape.sum())
-        if self._count > MAX_ESCAPES:
-            raise WorkLimitError(f"data must hold at most {MAX_ESCAPES} labels that no neighbour has; got more")
-        for index in np.flatnonzero(is_escape):
+    def code(self, pixels: Any, is_neither: Any) -> None:
+        """Code a wavefront's explicit labels; `is_neither` marks the coded pixels with neither candidate."""
+        is_explicit = pixels["is_coded"] == 0
+        is_explicit[~is_explicit] = is_neither
+        self._count += int(is_explicit.sum())
+        if self._count > MAX_EXPLICIT:
+            raise WorkLimitError(f"data must hold at most {MAX_EXPLICIT} labels that no neighbour has; got more")
+        for index in np.flatnonzero(is_explicit):
             pixels[index]["label"] = self._code_label(pixels[index])
 
     def _code_label(self, pixel: Any) -> int:

@@ -30,7 +30,7 @@ from .contexts import (
 )
 
 SLANT = 8  # pixels (x, y) of equal x + SLANT * y make a wavefront
-MAX_NEAREST = 3  # number of nearest labels that an escape's label is compared with
+MAX_NEAREST = 3  # nearest labels that an explicit label is compared with
 _MAX_RADIUS = 32  # radius of the search for nearest labels, in pixels
 _AHEAD = 128  # pixels of a row that are written ahead; if all were, each change would cost a whole row
 
@@ -113,17 +113,17 @@ def advance(scan, bits, truth):
 def _label_pixels(scan, bits):
     """Give the wavefront's pixels their labels and learn from them."""
     labels, lines, state = scan.labels, scan.lines, scan.state
-    num_escapes = state.num_coded if state.num_regions > 2 else 0
+    num_neither_bits = state.num_coded if state.num_regions > 2 else 0
     bit = 0
     for n in range(state.num_pixels):
         pixel = scan.pixels[n]
         if pixel.is_coded:
-            is_escape = False
-            if num_escapes > 0:
-                is_escape = bits[bit] != 0
+            is_neither = False
+            if num_neither_bits > 0:
+                is_neither = bits[bit] != 0
                 learn(scan.counters, scan.mixer, pixel, 1, bits[bit])
-            if not is_escape:
-                is_second = bits[num_escapes + bit]
+            if not is_neither:
+                is_second = bits[num_neither_bits + bit]
                 learn(scan.counters, scan.mixer, pixel, 0, is_second)
                 pixel.label = pixel.second if is_second else pixel.first
             bit += 1
@@ -167,7 +167,7 @@ def _find_pixels(scan):
         if quiet:
             pixel.first = labels[y, x - 1]
             pixel.second = -1
-            pixel.label = 1 - pixel.first  # the other of two regions; with more regions the escape overwrites it
+            pixel.label = 1 - pixel.first  # the other of two regions; its explicit label replaces it if there are more
         else:
             find_features(labels, pixel)
             state.num_coded += 1
@@ -204,9 +204,9 @@ def _fill_margins(labels, y, x, label):
 
 @inner
 def _estimate(scan, truth):
-    """Fill in chances, and answers if the truth is known: first whether pixels escape, then which candidate wins."""
+    """Fill in chances, and answers if the truth is known: first of "neither candidate", then of "the second"."""
     state, chances, answers = scan.state, scan.chances, scan.answers
-    num_escapes = state.num_coded if state.num_regions > 2 else 0
+    num_neither_bits = state.num_coded if state.num_regions > 2 else 0
     bit = 0
     for n in range(state.num_pixels):
         pixel = scan.pixels[n]
@@ -218,11 +218,11 @@ def _estimate(scan, truth):
             else:
                 scene_network(pixel, scan.units)
             find_counters(pixel)
-            if num_escapes > 0:
+            if num_neither_bits > 0:
                 chances[bit] = mix(scan.counters, scan.mixer, pixel, 1)
                 answers[bit] = pixel.label != pixel.first and pixel.label != pixel.second
-            chances[num_escapes + bit] = mix(scan.counters, scan.mixer, pixel, 0)
-            answers[num_escapes + bit] = pixel.label != pixel.first
+            chances[num_neither_bits + bit] = mix(scan.counters, scan.mixer, pixel, 0)
+            answers[num_neither_bits + bit] = pixel.label != pixel.first
             bit += 1
 
 

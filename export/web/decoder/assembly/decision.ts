@@ -1,4 +1,4 @@
-// The chance of a decision: the network and three counters, mixed (docs/format.md, "Chances of a pixel").
+// The chance of a decision: the network and three counters, mixed (docs/format.md, "Probabilities of a pixel").
 
 import { allot } from "./memory";
 import { CLIP, mixer } from "./network";

@@ -24,6 +24,13 @@ export function pixelAddress(y: i32, x: i32): usize {
   return labels + 4 * (<usize>y * stride + x);
 }
 
+/** Where the number of a row is in a list of one i32 per row. */
+// @ts-ignore: decorator
+@inline
+export function rowAddress(list: usize, y: i32): usize {
+  return list + 4 * y;
+}
+
 // @ts-ignore: decorator
 @inline
 export function label(y: i32, x: i32): i32 {
@@ -38,14 +45,14 @@ function fill(y: i32, x: i32, end: i32, label: i32): void {
 /** Rows continue with their last label, so that only pixels near contours are looked at. */
 export function continueRow(y: i32, x: i32, label: i32): void {
   fill(y, x, min(x + AHEAD, stride), label);
-  store<i32>(ends + 4 * y, x + AHEAD);
+  store<i32>(rowAddress(ends, y), x + AHEAD);
 }
 
 /** Continue a row where a wavefront at column `x` would look beyond what is written. */
 // @ts-ignore: decorator
 @inline
 export function reach(y: i32, x: i32): void {
-  if (x + RIGHT >= load<i32>(ends + 4 * y)) continueRow(y, x, label(y, x - 1));
+  if (x + RIGHT >= load<i32>(rowAddress(ends, y))) continueRow(y, x, label(y, x - 1));
 }
 
 /** Repeat the label of a pixel above and at the left of the map. */
@@ -55,7 +62,7 @@ export function repeat(y: i32, x: i32, label: i32): void {
 }
 
 /** Whether the neighbours of a pixel that come before it have one label. */
-export function allAlike(y: i32, x: i32): bool {
+export function isQuiet(y: i32, x: i32): bool {
   const first = label(y, x - 1);
   if (label(y, x - 2) !== first) return false;
   for (let i = x - 2; i < x + 8; i++) if (label(y - 1, i) !== first) return false;

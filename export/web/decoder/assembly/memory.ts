@@ -2,8 +2,8 @@
 export const NOT_A_STREAM = 0;
 export const MANY_SEEDS = 1;
 export const SEED_OUTSIDE = 2;
-export const MANY_UNCERTAIN = 3;
-export const MANY_ESCAPES = 4;
+export const MANY_CODED = 3;
+export const MANY_EXPLICIT = 4;
 export const NO_REGION = 5;
 export const MANY_GAUSSIANS = 6;
 export const NO_MEMORY = 7;

@@ -1,4 +1,4 @@
-// What a pixel may be before the map is known: a small network of integers (docs/format.md, "Chances of a pixel").
+// The first estimate of a pixel's label: a small network of integers (docs/format.md, "Probabilities of a pixel").
 // All sums of the tables' first layer are below 2**15.
 
 import { allot } from "./memory";

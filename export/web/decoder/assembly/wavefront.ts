@@ -1,15 +1,17 @@
 // A label map from wavefront to wavefront: pixels of equal x + 8 y (docs/format.md, "The wavefront").
 
 import { Decision } from "./decision";
-import { openEscapes, readEscape } from "./escapes";
-import { allAlike, pixelAddress, continueRow, label, LEFT, openMargins, reach, repeat, stride, strip, TOP } from "./margins";
-import { allot, fail, MANY_UNCERTAIN } from "./memory";
+import { openExplicitLabels, readExplicitLabel } from "./explicit_labels";
+import {
+  continueRow, isQuiet, label, LEFT, openMargins, pixelAddress, reach, repeat, rowAddress, stride, strip, TOP,
+} from "./margins";
+import { allot, fail, MANY_CODED } from "./memory";
 import { evaluate, features, neitherLogit, secondLogit } from "./network";
 import { bit } from "./range_decoder";
 
 const SLANT: i32 = 8;
 const PLACES: usize = 80; // of the template
-const MAX_UNCERTAIN: i32 = 1 << 23; // pixels that bits decide; more take minutes
+const MAX_CODED: i32 = 1 << 23; // pixels that bits decide; more take minutes
 // where the counters of each decision begin, and their number
 const SECOND: usize = 1 << 6;
 const THIRD: usize = SECOND + (1 << 11);
@@ -23,7 +25,7 @@ const NEITHER_COUNTERS: usize = NEITHER_THIRD + 6561;
  */
 export function readWavefronts(height: i32, width: i32, seeds: usize, regions: i32, template: usize): usize {
   openMargins(height, width);
-  openEscapes(regions);
+  openExplicitLabels(regions);
   const reader = WavefrontReader.of(height, width, seeds, regions, template);
   const last = width - 1 + SLANT * (height - 1);
   // the first pixel is of region 0, since regions are numbered as they are met
@@ -56,7 +58,7 @@ class WavefrontReader {
   wake: usize; // of each row the wavefront until which all of it is quiet
   pixels: usize; // those of a wavefront that do not continue their rows
   count: usize; // of these pixels
-  uncertain: i32; // pixels that bits decided so far
+  coded: i32; // pixels that bits decided so far
 
   static of(height: i32, width: i32, seeds: usize, regions: i32, template: usize): WavefrontReader {
     const reader = changetype<WavefrontReader>(allot(offsetof<WavefrontReader>()));
@@ -95,21 +97,22 @@ class WavefrontReader {
       const x = front - SLANT * j + LEFT;
       const y = j + TOP;
       reach(y, x);
-      if (load<i32>(this.wake + 4 * y) > front) continue;
+      if (load<i32>(rowAddress(this.wake, y)) > front) continue;
       const seed = this.findSeed(j, x);
       const before = label(y, x - 1);
-      if (!this.quiet(y, x)) this.ask(y, x, before);
+      if (!this.isStillQuiet(y, x)) this.ask(y, x, before);
       else if (x === seed) this.add(y, x, before, -1);
       else {
         repeat(y, x, before);
-        if (y >= TOP + 2 && load<i32>(this.changes + 4 * (y - 2)) < x) store<i32>(this.wake + 4 * y, front + seed - x);
+        if (y >= TOP + 2 && load<i32>(rowAddress(this.changes, y - 2)) < x)
+          store<i32>(rowAddress(this.wake, y), front + seed - x);
       }
     }
   }
 
   /** The column of the next seed of a row, or the row's end. */
   private findSeed(row: i32, x: i32): i32 {
-    const next = this.nextSeed + 4 * (row + TOP);
+    const next = rowAddress(this.nextSeed, row + TOP);
     let seed = max(load<i32>(next), x);
     const marks = this.seeds + <usize>row * this.width - LEFT;
     while (seed < this.width + LEFT && load<u8>(marks + seed) === 0) seed++;
@@ -117,14 +120,14 @@ class WavefrontReader {
     return seed;
   }
 
-  /** The same as `allAlike`, by the last changes of rows. */
-  private quiet(y: i32, x: i32): bool {
-    if (y < TOP + 2) return allAlike(y, x);
-    const change = this.changes + 4 * y;
+  /** The same as `isQuiet`, by the last changes of rows. */
+  private isStillQuiet(y: i32, x: i32): bool {
+    if (y < TOP + 2) return isQuiet(y, x);
+    const change = rowAddress(this.changes, y);
     if (load<i32>(change) > x - 2 || load<i32>(change - 4) > x - 2) return false;
     const before = label(y, x - 1);
     if (label(y - 1, x) !== before || label(y - 2, x) !== before) return false;
-    return load<i32>(change - 8) < x || allAlike(y, x);
+    return load<i32>(change - 8) < x || isQuiet(y, x);
   }
 
   private add(y: i32, x: i32, first: i32, second: i32): void {
@@ -164,7 +167,7 @@ class WavefrontReader {
   private readBits(): void {
     for (let n: usize = 0; n < this.count; n++) {
       if (this.pixel(n).second < 0) continue;
-      if (++this.uncertain > MAX_UNCERTAIN) fail(MANY_UNCERTAIN);
+      if (++this.coded > MAX_CODED) fail(MANY_CODED);
       if (this.several) this.pixel(n).bits = 2 * bit(this.isNeither.chance(n));
     }
     for (let n: usize = 0; n < this.count; n++) {
@@ -180,7 +183,7 @@ class WavefrontReader {
       // from here on the first candidate is the label
       const seed = one.second < 0;
       if (seed && !this.several) one.first = 1 - one.first;
-      else if (seed || one.bits >= 2) one.first = readEscape(one.y, one.x, one.first, one.second);
+      else if (seed || one.bits >= 2) one.first = readExplicitLabel(one.y, one.x, one.first, one.second);
       else if (one.bits) one.first = one.second;
     }
     for (let n: usize = 0; n < this.count; n++) {
@@ -195,8 +198,8 @@ class WavefrontReader {
 
   private write(y: i32, x: i32, region: i32): void {
     if (region !== label(y, x - 1)) {
-      store<i32>(this.changes + 4 * y, x);
-      memory.fill(this.wake + 4 * y, 0, 12); // these rows see it
+      store<i32>(rowAddress(this.changes, y), x);
+      memory.fill(rowAddress(this.wake, y), 0, 12); // these rows see it
       continueRow(y, x, region);
     }
     repeat(y, x, region);

@@ -1,4 +1,4 @@
-/** The earlier pixels that tell of a pixel (docs/format.md, "Chances of a pixel"). */
+/** The earlier pixels that tell of a pixel (docs/format.md, "Probabilities of a pixel"). */
 
 /** Columns of each row above the pixel that are seen, nearest row first. */
 const REACH = [
