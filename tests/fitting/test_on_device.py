@@ -29,7 +29,7 @@ from kcgs.optim.gaussians import Gaussians, Renderer
 
 from .absent_device import AbsentDevice, DeviceTensor
 
-ITERATIONS = 240
+ITERATIONS = 160
 Stepping = Callable[[FitState], Any]
 
 
@@ -78,8 +78,7 @@ class IdleDevice(Readback):
         return super().numbers()
 
 
-@pytest.mark.parametrize("objective", ["l1", "l2"])
-@pytest.mark.parametrize("has_maps", [False, True])
+@pytest.mark.parametrize(("objective", "has_maps"), [("l1", True), ("l2", False)])
 def test_the_errors_of_a_batch_are_those_of_each_image(objective: str, has_maps: bool) -> None:
     """On a CPU bit for bit; on a device up to the order of sums, and without a wait."""
     images = torch.stack([image(), image().flip(1), image().flip(2)])
@@ -104,9 +103,10 @@ def test_the_errors_of_a_batch_are_those_of_each_image(objective: str, has_maps:
 
 
 def test_steps_that_are_not_waited_for_are_those_that_are() -> None:
-    for images in (None, torch.stack([image(), image().flip(2).square()])):
-        assert same(run(EagerStepper, images=images), run(CudaStepper, images=images))
-        assert same(run(EagerStepper, images=images), run(lambda state: CudaStepper(state, IdleDevice), images=images))
+    images = torch.stack([image(), image().flip(2).square()])
+    waiting = run(EagerStepper, images=images)
+    for stepper_of in (CudaStepper, lambda state: CudaStepper(state, IdleDevice)):
+        assert same(waiting, run(stepper_of, images=images))
 
 
 def test_a_late_history_is_the_history() -> None:
@@ -119,7 +119,7 @@ def test_a_late_history_is_the_history() -> None:
         num_late += entry.iteration < max(i for i in measured if i < iteration)
         assert entry.iteration >= max(i for i in measured if i <= max(0, iteration - 21))
 
-    assert same(at_once, run(lambda state: CudaStepper(state, IdleDevice), on_step)) and num_late > 50
+    assert same(at_once, run(lambda state: CudaStepper(state, IdleDevice), on_step)) and num_late > 30
 
 
 def test_nothing_moves_where_a_step_had_no_room(adam_of_a_device: pytest.MonkeyPatch) -> None:
@@ -264,9 +264,9 @@ def test_a_step_reads_no_value_and_takes_few_operations(adam_of_a_device: pytest
         steppers.append(CountedStepper(state, counter))
         return steppers[-1]
 
-    run(stepper_of, iterations=300)
+    run(stepper_of)
     counts = steppers[0].counts
-    assert len(counts) > 150 and min(counts) == max(counts) == 2
+    assert len(counts) > 60 and min(counts) == max(counts) == 2
 
 
 def test_contours_move_on_a_device_with_few_waits_and_sums_of_one_order(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -287,7 +287,7 @@ def test_contours_move_on_a_device_with_few_waits_and_sums_of_one_order(monkeypa
     labels[20:, 25:] = 5
     painted = (image() + 0.3 * (labels == 1) - 0.2 * (labels == 5)).clamp(0.0, 1.0)
     with device.use():
-        result = fit(DeviceTensor(painted), labels, 60, recipe=FitConfig(iterations=60))
+        result = fit(DeviceTensor(painted), labels, 60, recipe=FitConfig(iterations=30))
     assert isinstance(result.scene.regions.softness, PairSoftness)
     assert len(counts) > 5 and len(maps) > 2
     assert max(operations for operations, _ in counts) < 165 and max(waits for _, waits in counts) < 25

@@ -11,8 +11,7 @@ from kcgs.optim.gaussians import Gaussians, Renderer
 SIZE = (24, 40)
 
 
-@pytest.mark.parametrize("softness", [None, 0.8])
-@pytest.mark.parametrize("backend", ["cpu", "tiled"])
+@pytest.mark.parametrize(("backend", "softness"), [("cpu", None), ("cpu", 0.8), ("tiled", 0.8)])
 def test_inner_products_are_those_of_rendered_gaussians(backend: str, softness: float | None) -> None:
     labels = (torch.arange(40) >= 18).long().expand(SIZE).contiguous()
     regions = None if softness is None else RegionMap(labels, softness)
