@@ -7,8 +7,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from scipy.ndimage import distance_transform_edt
-from skimage.measure import label
 from torch import Tensor
 
 from kcgs import GaussianField, RegionMap, Scene
@@ -93,18 +91,6 @@ def contour_energy(scene: Scene, image: Tensor, length_weight: float = 0.003, bl
     return float(sum(energies)) + length_weight / 4 * pairs + length_weight * 0.3 * curvature(regions.labels)
 
 
-def small_pieces(labels: Tensor, smallest: int) -> int:
-    pieces = label(labels.numpy() + 1, background=0, connectivity=1)
-    return int((np.bincount(pieces.ravel())[1:] < smallest).sum())
-
-
-def assert_within(labels: Tensor, given: Tensor, distance: float) -> None:
-    """Every pixel's label is in `given` within the distance."""
-    for region in labels.unique().tolist():
-        away = distance_transform_edt((given != region).numpy())
-        assert away[(labels == region).numpy()].max() <= distance + 1e-9
-
-
 class TestEnergy:
     def test_is_the_formula(self) -> None:
         field, image, regions = noisy_problem(1, torch.float64)
@@ -169,15 +155,6 @@ class TestMoves:
             regions = refine_contours(Scene(field, regions), image, anchor=given)
         assert torch.equal(regions.labels, step(15))
 
-    @pytest.mark.parametrize(("seed", "distance"), [(0, 1), (1, 2.3)])
-    def test_distance_bound_on_noise(self, seed: int, distance: float) -> None:
-        field, image, start = noisy_problem(seed)
-        regions = start
-        for _ in range(3):
-            regions = refine_contours(Scene(field, regions), image, anchor=start.labels, max_distance=distance, reach=3)
-            assert_within(regions.labels, start.labels, distance)
-            assert set(regions.ids.tolist()) == set(start.ids.tolist())
-
     def test_without_bound_it_moves_on(self) -> None:
         image, regions = step(30).float()[None], RegionMap(step(12))
         field = flat_field({0: [0.0], 1: [1.0]}, (24, 40))
@@ -208,7 +185,7 @@ class TestShape:
         image[:, 14:16, 9:11] = 1.0
         field, regions = flat_field({0: [0.0], 1: [1.0]}, (24, 40)), RegionMap(step(12))
         kept = refine_contours(Scene(field, regions), image, blur=0.0, smallest=1)
-        assert small_pieces(kept.labels, 12) == 2
+        assert (kept.labels != step(12)).sum() == 8
         refined = refine_contours(Scene(field, RegionMap(step(11))), image, blur=0.0)
         assert torch.equal(refined.labels, step(12))
 
@@ -222,15 +199,6 @@ class TestShape:
         want[4:6, 30:33] = 2
         assert torch.equal(refine_contours(Scene(field, labels), image, blur=0.0).labels, want)
 
-    @pytest.mark.parametrize("seed", range(2))
-    def test_no_new_specks_on_noise(self, seed: int) -> None:
-        field, image, regions = noisy_problem(seed)
-        assert small_pieces(regions.labels, 12) == 0
-        free = refine_contours(Scene(field, regions), image, max_distance=None, smallest=1)
-        refined = refine_contours(Scene(field, regions), image, max_distance=None)
-        # what a region must keep may lie in pieces
-        assert small_pieces(refined.labels, 12) < max(1, small_pieces(free.labels, 12) // 4)
-
     @pytest.mark.parametrize("distance", [3.0, None])
     def test_no_region_vanishes(self, distance: float | None) -> None:
         labels = step(20)
@@ -243,23 +211,6 @@ class TestShape:
             kept = [int((refined.labels == region).sum()) for region in (5, 6, 9)]
             assert kept == [1, 2, 12]
             assert refined.labels[3, 3] == 5 and (refined.labels[10:12, 8] == 6).all()
-
-    def test_dear_contours_are_short_and_smooth(self) -> None:
-        draw = torch.Generator().manual_seed(0)
-        labels = step(20)
-        labels[::2, 20:22] = 0  # a comb
-        image = (step(20).float() + 0.8 * torch.randn(24, 40, generator=draw))[None]
-        field, regions = flat_field({0: [0.0], 1: [1.0]}, (24, 40)), RegionMap(labels)
-
-        def length(weight: float) -> float:
-            settings = {"blur": 0.0, "smallest": 1, "max_distance": None}
-            refined = refine_contours(Scene(field, regions), image, length_weight=weight, **settings)
-            flat, dark = flat_field({0: [0.0], 1: [0.0]}, (24, 40)), torch.zeros(1, 24, 40)
-            return contour_energy(Scene(flat, refined), dark, length_weight=1.0)
-
-        lengths = [length(weight) for weight in (0.0, 0.3, 3.0)]
-        assert lengths[0] > 1.5 * lengths[1] > 1.5 * lengths[2]
-        assert lengths[2] < 1.2 * (24 + 2 * 23) / 4
 
     def test_bumps_cost_and_thin_legs_do_not(self) -> None:
         labels = step(12)

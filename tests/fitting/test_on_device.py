@@ -29,7 +29,7 @@ from kcgs.optim.gaussians import Gaussians, Renderer
 
 from .absent_device import AbsentDevice, DeviceTensor
 
-ITERATIONS = 160
+ITERATIONS = 200
 Stepping = Callable[[FitState], Any]
 
 

@@ -92,7 +92,7 @@ class TestLoss:
             ),
             ({"densify": 3}, "densify must be an event with `act` and `end`, or None: matching pursuit; got 3"),
             ({"initializer": 3}, "initializer must be a name or a function; got 3"),
-            ({"bounded": True, "optimizer": GaussianAdam}, "bounded must be False with an optimizer of your own; got T"),
+            ({"bounded": True, "optimizer": GaussianAdam}, "bounded must be False with an optimizer of your own"),
         ],
     )
     def test_bad_arguments(self, change: dict[str, Any], words: str) -> None:

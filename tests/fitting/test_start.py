@@ -81,12 +81,12 @@ class TestInitialField:
         field = initial_field(torch.full((1, 3, 4), 0.5), 5, RegionMap(labels), 0)
         assert field.region_ids is not None and len(field.region_ids.unique()) == 5
 
-    @pytest.mark.parametrize("maps", ["none", "one", "float masks", "RegionMap"])
+    @pytest.mark.parametrize("maps", ["none", "one", "masks", "RegionMap"])
     def test_a_batch_is_its_images(self, maps: str) -> None:
         image, labels = scene()
         images = torch.stack([image.roll(5 * k, -1) for k in range(3)])
         each = torch.stack([labels.roll(5 * k, -1) for k in range(3)])
-        regions = {"none": None, "one": labels, "float masks": each[:, None].float(), "RegionMap": RegionMap(each)}[maps]
+        regions = {"none": None, "one": labels, "masks": each[:, None].float(), "RegionMap": RegionMap(each)}[maps]
         alone = [None if maps == "none" else labels if maps == "one" else each[k] for k in range(3)]
         batch = initial_field(images, 40, regions, seed=2)
         assert batch.means.shape == (3, 40, 2)
