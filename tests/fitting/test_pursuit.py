@@ -114,16 +114,6 @@ class TestGain:
             is_same = marks == marks[block // 2, block // 2]
             torch.testing.assert_close(averages[image, :, row, column], (values * is_same).mean((1, 2)))
 
-    def test_finds_the_gaussian_that_is_there(self) -> None:
-        mean, cholesky = torch.tensor([[20.5, 14.5]]), torch.tensor([[1.8, 0.0, 1.8]])
-        color = torch.tensor([[0.6, -0.2, 0.1]])
-        residual = region_splat(mean, cholesky, color, size=(32, 48))
-        proposal = propose(residual, None, 1)
-        assert proposal.cholesky.tolist() == cholesky.tolist()
-        assert (proposal.means - mean).abs().max() <= 1
-        torch.testing.assert_close(proposal.colors, color, atol=0.06, rtol=0.1)
-
-
 class TestProposal:
     @pytest.mark.parametrize(("channels", "dtype"), [(1, torch.float32), (8, torch.float64)])
     def test_shapes_and_order(self, channels: int, dtype: torch.dtype) -> None:
