@@ -48,18 +48,6 @@ class TestDensify:
         counts = targets((p / 1000 for p in range(400, 1000)), iterations=iterations)
         assert sum(b > a for a, b in pairwise(counts)) == cycles
 
-    def test_acts_where_the_schedule_asks_for_more(self) -> None:
-        state, densify = state_of(60), Densify()
-        state.progress = 0.05
-        densify.act(state)
-        assert state.num_gaussians == 1  # nothing is measured yet
-        state.history.append(HistoryEntry(0, 0.0, 1.0, 10.0, 10.0, 5))
-        densify.act(state)
-        count = state.num_gaussians
-        assert count > 1
-        densify.act(state)
-        assert state.num_gaussians == count
-
     def test_a_clock_does_not_change_the_number_of_cycles(self) -> None:
         """Iterations of a fit that a clock ends take more and less time."""
         state, densify = state_of(60, max_seconds=9.0), Densify()
