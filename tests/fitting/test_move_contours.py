@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -133,36 +134,26 @@ class TestEnergy:
 
 
 class TestMoves:
-    @pytest.mark.parametrize(("given", "softness"), [(10, 0.0), (14, 0.7)])
-    def test_onto_the_edge(self, given: int, softness: float) -> None:
-        image = step(12).float()[None].expand(3, -1, -1)
-        field = flat_field({0: [0.0] * 3, 1: [1.0] * 3}, (24, 40))
-        refined = refine_contours(Scene(field, RegionMap(step(given), softness)), image)
-        assert torch.equal(refined.labels, step(12))
-        assert refined.softness == softness
-        assert torch.allclose(Scene(field, refined.labels).render(), image, atol=1e-3)
+    @pytest.mark.parametrize(
+        ("start", "edge", "settings", "calls", "end"),
+        [
+            (10, 12, {}, 1, 12),
+            (14, 12, {}, 1, 12),
+            (12, 20, {"anchor": step(12)}, 4, 15),
+            (12, 30, {"max_distance": None}, 1, 18),  # reach times sweeps
+            (12, 30, {"max_distance": None}, 4, 30),
+        ],
+    )
+    def test_towards_the_edge(self, start: int, edge: int, settings: dict[str, Any], calls: int, end: int) -> None:
+        field, regions = flat_field({0: [0.0], 1: [1.0]}, (24, 40)), RegionMap(step(start), 0.7)
+        for _ in range(calls):
+            regions = refine_contours(Scene(field, regions), step(edge).float()[None], **settings)
+        assert torch.equal(regions.labels, step(end)) and regions.softness == 0.7
 
     def test_a_map_that_is_right_stays(self) -> None:
         regions = RegionMap(step(12))
         field = flat_field({0: [0.0], 1: [1.0]}, (24, 40))
         assert refine_contours(Scene(field, regions), step(12).float()[None]) is regions
-
-    def test_distance_bound_holds_for_repeated_calls(self) -> None:
-        image, given = step(20).float()[None], step(12)
-        field = flat_field({0: [0.0], 1: [1.0]}, (24, 40))
-        regions = RegionMap(given)
-        for _ in range(4):
-            regions = refine_contours(Scene(field, regions), image, anchor=given)
-        assert torch.equal(regions.labels, step(15))
-
-    def test_without_bound_it_moves_on(self) -> None:
-        image, regions = step(30).float()[None], RegionMap(step(12))
-        field = flat_field({0: [0.0], 1: [1.0]}, (24, 40))
-        once = refine_contours(Scene(field, regions), image, max_distance=None)
-        assert torch.equal(once.labels, step(18))  # reach times sweeps
-        for _ in range(3):
-            once = refine_contours(Scene(field, once), image, max_distance=None)
-        assert torch.equal(once.labels, step(30))
 
     def test_only_labels_within_reach(self) -> None:
         # the best colour for the middle is that of a region that is far from it
