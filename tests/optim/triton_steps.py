@@ -96,19 +96,6 @@ def test_takes_the_steps_of_torch_operations(kind: str, launches: list[int]) -> 
         torch.testing.assert_close(value, expected, rtol=1e-5, atol=1e-6, check_dtype=False)
 
 
-def test_a_step_whose_gradients_are_nan_changes_nothing(launches: list[int]) -> None:
-    field = field_of("plain")
-    optimizer = GaussianAdam(field)
-    give_gradients(torch.Generator().manual_seed(2), field)
-    optimizer.step()
-    before = copy.deepcopy([*field.parameters(), *states(optimizer)])
-    for parameter in field.parameters():
-        parameter.grad = torch.full_like(parameter, math.nan)
-    optimizer.step()
-    assert len(launches) == 2
-    assert all(torch.equal(a, b) for a, b in zip(before, [*field.parameters(), *states(optimizer)], strict=True))
-
-
 @pytest.mark.filterwarnings("ignore:overflow")  # numpy's, in the interpreter
 def test_rates_that_overflow_leave_numbers_finite() -> None:
     field, generator = field_of("plain"), torch.Generator().manual_seed(2)
