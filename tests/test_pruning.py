@@ -35,15 +35,14 @@ class TestPrune(
         assert 0 < result.num_pruned < 300 and 0 < result.prune_error <= 1e-2
         assert image.device.type == device.type and image.dtype == scene.field.colors.dtype and image.any()
 
-    @pytest.mark.parametrize("channels", [1, 4])
-    @pytest.mark.parametrize("count", [0, 1, 20])
+    @pytest.mark.parametrize(("count", "channels"), [(0, 1), (1, 4), (20, 4)])
     def test_cardinality(self, device: torch.device, count: int, channels: int) -> None:
         scene = Scene(GaussianField.random(count, (9, 17), channels=channels, seed=0), metadata={"title": "few"})
         result = prune(scene.to(device), tolerance=0.1)
         assert result.scene.num_gaussians == count - result.num_pruned and result.scene.size == (9, 17)
         assert result.scene().shape == (channels, 9, 17) and result.scene.metadata == {"title": "few"}
 
-    @pytest.mark.parametrize("tolerance", [0.0, 1e-4, 1e-2, 0.1])
+    @pytest.mark.parametrize("tolerance", [0.0, 1e-2])
     def test_feature(self, scene: Scene, tolerance: float) -> None:
         result = prune(scene, tolerance=tolerance)
         with torch.no_grad():
@@ -51,8 +50,7 @@ class TestPrune(
         assert float(change) == result.prune_error <= tolerance + 1e-6
         assert result.scene.num_gaussians == 300 - result.num_pruned
 
-    @pytest.mark.parametrize("maps", [None, "one", "each"])
-    @pytest.mark.parametrize("tolerance", [0.0, 1e-2, 1e3])
+    @pytest.mark.parametrize(("maps", "tolerance"), [(None, 1e-2), ("one", 0.0), ("each", 1e-2), ("each", 1e3)])
     def test_a_batch_is_as_each_image_alone(self, maps: str | None, tolerance: float) -> None:
         """Gaussians keep their row, and those that go have the colour 0."""
         labels = torch.stack([(torch.arange(60) >= x).long().expand(40, 60) for x in (20, 30, 40)])

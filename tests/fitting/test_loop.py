@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from kcgs import FitConfig, GaussianField, RegionMap, fit
-from kcgs.data import chart_2x3, chart_pie
+from kcgs.data import chart_2x3
 from kcgs.fitting import available_recipes
 from kcgs.fitting.events import Warmup, contours
 from kcgs.fitting.gaussian_image import GaussianImageAdan
@@ -36,14 +36,6 @@ def quick(recipe: str = "paper", **settings: object) -> FitConfig:
 
 
 class TestResult:
-    def test_psnr_is_that_of_the_rendered_scene(self) -> None:
-        image, labels = disc()
-        result = fit(image, labels, 12, recipe=quick())
-        picture = result.scene.render()
-        best = max(entry.psnr for entry in result.history)
-        assert float(psnr(picture, image)) == pytest.approx(best, abs=1e-3)
-        assert result.stop_reason == "iterations"
-
     def test_history(self) -> None:
         image, labels = disc()
         history = fit(image, labels, 12, recipe=quick(iterations=200)).history
@@ -56,15 +48,7 @@ class TestResult:
         image, labels = disc()
         result = fit(image, labels, 12, recipe=quick())
         best = max(result.history, key=lambda h: h.psnr)
-        picture = result.scene.render()
-        assert float(ef_psnr(picture, image, labels)) == pytest.approx(best.ef_psnr, abs=1e-3)
-
-    def test_same_seed_same_bits(self) -> None:
-        image, labels = disc()
-        a, b, c = (fit(image, labels, 12, seed=s, recipe=quick()) for s in (5, 5, 6))
-        for name in ("means", "cholesky", "colors", "region_ids"):
-            assert torch.equal(getattr(a.scene.field, name), getattr(b.scene.field, name))
-        assert not torch.equal(a.scene.field.means, c.scene.field.means)
+        assert float(ef_psnr(result.scene.render(), image, labels)) == pytest.approx(best.ef_psnr, abs=1e-3)
 
     @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
     def test_inside_no_grad(self, mode: type) -> None:
@@ -77,10 +61,10 @@ class TestResult:
     def test_input_is_not_changed(self) -> None:
         image, labels = disc()
         copies = image.clone(), labels.clone()
-        fit(image, labels, 5, recipe=quick())
+        fit(image, labels, 5, recipe=quick(iterations=5))
         assert torch.equal(image, copies[0]) and torch.equal(labels, copies[1])
 
-    @pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 3)])
+    @pytest.mark.parametrize("size", [(1, 1), (7, 3)])
     def test_smaller_than_a_tile(self, size: tuple[int, int]) -> None:
         result = fit(torch.full((3, *size), 0.5), None, min(3, size[0] * size[1]), recipe=quick(iterations=400))
         assert result.history[-1].psnr > 20
@@ -92,7 +76,9 @@ class TestSettings:
         assert set(available_recipes()) == {"best", "best-baseline", "best-refined", *published}
 
     def test_the_defaults_are_the_recipe_best(self) -> None:
+        image, labels = disc()
         assert FitConfig() == FitConfig.from_recipe("best")
+        assert fit(image, labels, 5, iterations=1).config == FitConfig(iterations=1, objective="l2")
 
     def test_a_recipe_by_name_or_whole_and_settings_over_it(self) -> None:
         image, labels = disc()
@@ -114,43 +100,16 @@ class TestSettings:
             assert FitConfig(**tomllib.loads(toml)) == config
             assert FitConfig.model_validate_json(config.model_dump_json()) == config
 
-    def test_arrays_and_pil_images(self) -> None:
-        from PIL import Image
-
+    def test_one_image_takes_a_batch_of_one_map(self) -> None:
         image, labels = disc()
-        pixels = (255 * image.permute(1, 2, 0)).round().to(torch.uint8)
-        want = fit(pixels.permute(2, 0, 1).float() / 255, labels, 5, recipe=quick(iterations=5)).scene.field
-        for given in (pixels.numpy(), pixels.numpy().astype("float32") / 255, Image.fromarray(pixels.numpy())):
-            got = fit(given, labels, 5, recipe=quick(iterations=5)).scene.field
-            assert torch.equal(got.means, want.means) and torch.equal(got.colors, want.colors)
-
-    @pytest.mark.parametrize("kind", ["bool", "array", "one of a batch", "RegionMap of one"])
-    def test_kinds_of_label_maps(self, kind: str) -> None:
-        image, labels = disc()
-        given = {
-            "bool": labels.bool(),
-            "array": labels.bool().numpy(),
-            "one of a batch": labels[None],
-            "RegionMap of one": RegionMap(labels[None], {(0, 1): 0.5}),
-        }[kind]
-        softness = 0.5 if kind.startswith("Region") else 0.0
-        recipe = quick(softness=softness, iterations=5)
-        want, got = (fit(image[None], regions, 5, recipe=recipe).scene for regions in (labels, given))
+        regions = RegionMap(labels[None], {(0, 1): 0.5})
+        want = fit(image, labels, 5, recipe=quick(softness=0.5, iterations=5)).scene
+        got = fit(image, regions, 5, recipe=quick(iterations=5)).scene
         assert torch.equal(got.field.means, want.field.means)
         assert torch.equal(got.regions.labels, labels)  # type: ignore[union-attr]
 
 
 class TestSwitches:
-    @pytest.mark.parametrize("guidance", [True, False])
-    @pytest.mark.parametrize("warmup", [True, False])
-    @pytest.mark.parametrize("clamp", [True, False])
-    def test_ablation_rows(self, guidance: bool, warmup: bool, clamp: bool) -> None:
-        image, labels = disc()
-        result = fit(image, labels, 8, recipe=quick(guidance=guidance, warmup=warmup, clamp=clamp))
-        assert (result.scene.regions is not None) == guidance
-        assert (result.scene.field.region_ids is not None) == guidance
-        assert result.history[-1].psnr > result.history[0].psnr
-
     def test_warmup_moves_ids_and_no_warmup_freezes_them(self) -> None:
         image, labels = disc()
         start = fit(image, labels, 60, recipe=quick(iterations=1, warmup=False)).scene.field.region_ids
@@ -158,11 +117,6 @@ class TestSwitches:
         assert torch.equal(frozen.region_ids, start)
         moved = fit(image, labels, 60, recipe=quick(iterations=300)).scene.field
         assert not torch.equal(moved.region_ids, start)
-
-    def test_clamp_changes_the_fit(self) -> None:
-        image, labels = disc()
-        free, clamped = (fit(image, labels, 8, recipe=quick(clamp=c)).scene.field.colors for c in (False, True))
-        assert not torch.equal(free, clamped)
 
     def test_clamp_of_saturated_pictures(self) -> None:
         image, labels = disc()
@@ -172,38 +126,31 @@ class TestSwitches:
 
     def test_values_overshoot_only_where_the_image_is_saturated(self) -> None:
         image = torch.tensor([0.0, 1.0, 0.5, 0.5]).expand(1, 6, 4)
-        bounds = make_problem(image, None, 1, FitConfig(), 0).bounds
-        assert bounds is not None
-        for outside, clipped in ((2.0, [2.0, 1.0, 2.0, 2.0]), (-1.0, [0.0, -1.0, -1.0, -1.0])):
-            clamped = torch.full((1, 1, 6, 4), outside).clamp(*bounds)
-            assert torch.equal(clamped, torch.tensor(clipped).expand(1, 1, 6, 4))
+        values = torch.tensor([2.0, -1.0]).view(2, 1, 1, 1).expand(2, 1, 6, 4)
+        for clamp, clipped in (
+            (True, [[1.0] * 4, [0.0] * 4]),
+            ("auto", [[2.0, 1.0, 2.0, 2.0], [0.0, -1.0, -1.0, -1.0]]),
+        ):
+            bounds = make_problem(image, None, 1, FitConfig(clamp=clamp), 0).bounds
+            assert bounds is not None and values.clamp(*bounds)[:, 0, 5].tolist() == clipped
+        assert make_problem(image, None, 1, FitConfig(clamp=False), 0).bounds is None
 
-    @pytest.mark.parametrize("objective", ["l1", "l2"])
-    def test_objectives_of_adan(self, objective: str) -> None:
+    def test_adan_lowers_the_squared_error(self) -> None:
         image, labels = disc()
-        result = fit(image, labels, 12, recipe=quick(objective=objective, optimizer="adan", iterations=300))
+        result = fit(image, labels, 12, recipe=quick(objective="l2", optimizer="adan", iterations=300))
         assert result.history[-1].psnr > 24
 
     def test_softness_of_the_map_or_the_recipe(self) -> None:
         image, labels = disc()
-        assert fit(image, RegionMap(labels, 0.9), 5, recipe=quick()).scene.regions.softness == 0.9
-        assert fit(image, labels, 5, recipe=quick(softness=0.7)).scene.regions.softness == 0.7
+        recipe = quick(iterations=1, softness=0.7)
+        assert fit(image, RegionMap(labels, 0.9), 5, recipe=recipe).scene.regions.softness == 0.9
+        assert fit(image, labels, 5, recipe=recipe).scene.regions.softness == 0.7
 
-    def test_no_region_starts_empty(self) -> None:
-        labels = torch.zeros(40, 40, dtype=torch.long)
-        labels[:4, :4], labels[30:33, 30:33] = 8, 9
-        start = fit(torch.rand(3, 40, 40), labels, 3, recipe=quick(iterations=1)).scene.field.region_ids
-        assert sorted(start.tolist()) == [0, 8, 9]
-
-    def test_one_region_is_no_region(self) -> None:
+    @pytest.mark.parametrize("settings", [{"objective": "ms-ssim"}, {"recipe": "paper"}, {"objective": "l1"}])
+    def test_the_psnr_is_that_of_the_scene(self, settings: dict[str, str]) -> None:
         image, labels = disc()
-        assert fit(image, torch.zeros_like(labels), 5, recipe=quick()).scene.regions is None
-
-    def test_the_psnr_is_that_of_the_scene(self) -> None:
-        image, labels = disc()
-        for settings in ({"objective": "ms-ssim"}, {"recipe": "best"}, {"recipe": "best", "objective": "l1"}):
-            result = fit(image, labels, 12, iterations=60, prune=0.0, **settings)
-            assert float(psnr(result.scene.render(), image)) == pytest.approx(result.psnr, abs=1e-3)
+        result = fit(image, labels, 12, iterations=60, prune=0.0, **settings)
+        assert float(psnr(result.scene.render(), image)) == pytest.approx(result.psnr, abs=1e-3)
 
     def test_warmup_leaves_no_region_without_its_last_gaussian(self) -> None:
         image, labels = disc()
@@ -227,19 +174,12 @@ class TestSwitches:
 
 
 class TestStopping:
-    @pytest.mark.usefixtures("clock")
-    def test_seconds(self) -> None:
-        image, labels = disc()
-        result = fit(image, labels, 12, recipe=quick(iterations=10**7, max_seconds=0.5))
-        assert result.stop_reason == "seconds"
-        assert 0.4 < result.history[-1].seconds < 0.6
-
     def test_compilation_takes_none_of_the_time(self, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr("kcgs.fitting.loop.precompile", lambda config, device: clock.advance(100.0))
         result = fit(*disc(), 12, recipe=quick(iterations=10**7, max_seconds=0.5))
-        assert clock.seconds > 100 and result.seconds < 1
+        assert result.stop_reason == "seconds" and clock.seconds > 100 and 0.4 < result.seconds < 0.6
 
-    @pytest.mark.parametrize(("seconds", "is_moved"), [(0.0, True), (0.2, True), (1.0, False)])
+    @pytest.mark.parametrize(("seconds", "is_moved"), [(0.2, True), (1.0, False)])
     def test_contours_keep_to_their_share_of_the_clock(
         self, clock: Clock, monkeypatch: pytest.MonkeyPatch, seconds: float, is_moved: bool
     ) -> None:
@@ -258,19 +198,6 @@ class TestStopping:
         result = fit(image, labels, 12, recipe="best", iterations=10**7, max_seconds=3.0)
         assert result.stop_reason == "seconds" and bool(moves) == is_moved and sum(moves) <= 0.75
 
-    def test_callback(self) -> None:
-        image, labels = disc()
-        result = fit(image, labels, 12, recipe=quick(), on_step=lambda i, entry: i == 17)
-        assert result.stop_reason == "callback"
-        assert result.history[-1].iteration == 17
-
-    def test_divergence_keeps_the_best(self) -> None:
-        image, labels = disc()
-        with pytest.warns(UserWarning, match="diverged"):
-            result = fit(image, labels, 12, recipe=quick(objective="l2", learning_rate_factor=1e33))
-        assert result.stop_reason == "diverged"
-        assert torch.isfinite(result.scene.field.colors).all()
-
     def test_never_ends_below_the_best(self) -> None:
         image, labels = disc()
         result = fit(image, labels, 12, recipe=quick(learning_rate_factor=1000.0))
@@ -278,19 +205,16 @@ class TestStopping:
         assert float(psnr(picture, image)) >= max(h.psnr for h in result.history) - 0.01
 
 
-class TestCharts:
+def test_paper_beats_both_baselines() -> None:
     """The paper's first experiment in short: 20 Gaussians, guidance far ahead of the baseline at contours."""
-
-    @pytest.mark.parametrize(("chart", "lead"), [(chart_2x3, 5.0), (chart_pie, 3.0)])
-    def test_paper_beats_both_baselines(self, chart: object, lead: float) -> None:
-        image, labels = chart()  # type: ignore[operator]
-        best = {}
-        for recipe in ("paper", "gaussian-image", "gaussian-image-clamp"):
-            history = fit(image, labels, 20, recipe=recipe, iterations=200).history
-            best[recipe] = max(history, key=lambda h: h.psnr)
-        for baseline in ("gaussian-image", "gaussian-image-clamp"):
-            assert best["paper"].psnr > best[baseline].psnr + lead
-            assert best["paper"].ef_psnr > best[baseline].ef_psnr + lead
+    image, labels = (part[..., ::2, ::2] for part in chart_2x3())
+    best = {}
+    for recipe in ("paper", "gaussian-image", "gaussian-image-clamp"):
+        history = fit(image, labels, 20, recipe=recipe, iterations=200).history
+        best[recipe] = max(history, key=lambda h: h.psnr)
+    for baseline in ("gaussian-image", "gaussian-image-clamp"):
+        assert best["paper"].psnr > best[baseline].psnr + 5
+        assert best["paper"].ef_psnr > best[baseline].ef_psnr + 5
 
 
 class TestErrors:
@@ -307,16 +231,15 @@ class TestErrors:
                 r"image must be in \[0, 1\]; got \[2, 2\]: divide it by 255",
             ),
             ({"image": torch.full((3, 4, 4), math.nan)}, ValueError, "image must be finite"),
-            ({"image": torch.zeros(3, 0, 4)}, ValueError, "image must not be empty"),
             ({"image": torch.zeros(3, 4, 4, dtype=torch.uint8)}, TypeError, "got torch.uint8: pass image / 255"),
             ({"regions": torch.zeros(5, 4).long()}, ValueError, "regions must be one map of the image's size"),
             ({"regions": 3}, TypeError, "regions must be a RegionMap"),
             ({"num_gaussians": 0}, ValueError, "num_gaussians must be at least 1; got 0"),
+            ({"num_gaussians": 50}, ValueError, "num_gaussians must be at most 16, the pixels of the 4 x 4 image"),
+            ({"num_gaussians": 2.5}, TypeError, "num_gaussians must be an integer; got 2.5"),
             ({"seed": "a"}, TypeError, "seed must be an integer; got 'a'"),
             ({"seed": -1}, ValueError, r"seed must be in \[0, 9223372036854775807\]; got -1"),
-            ({"num_gaussians": 2.5}, TypeError, "num_gaussians must be an integer; got 2.5"),
             ({"recipe": "best-ever"}, ValueError, "recipe must be one of .*paper.*; got 'best-ever'"),
-            ({"recipe": "image-gs"}, ValueError, "recipe must be .*; got 'image-gs', which is now in benchmarks/core/"),
         ],
     )
     def test_bad_input(self, change: dict[str, object], error: type[Exception], words: str) -> None:
@@ -330,20 +253,8 @@ class TestErrors:
             ({"speed": 5}, "^unknown setting 'speed': there are guidance, .*, target_psnr$"),
             ({"iterations": 0}, "iterations must be greater than or equal to 1; got 0"),
             ({"objective": "l3"}, "^objective must be one of l2, l1, ms-ssim; got 'l3'$"),
-            ({"objective": "psnr"}, "^objective must be one of l2, .*; got 'psnr', which is now 'l2'$"),
-            ({"objective": "auto"}, "^objective must be .*; got 'auto', which is now the default: leave it out$"),
             ({"objective": abs}, "^objective must be .*; got a function, which only kcgs.fit takes$"),
-            ({"loss": "l1"}, "^unknown setting 'loss': it is objective now, with the same values$"),
-            (
-                {"objective": "l1+ssim"},
-                "^objective must be .*, which is now in benchmarks/core/",
-            ),
-            (
-                {"densify": "largest-error"},
-                "^unknown setting 'densify': it is an argument of fit, .*image_gs.py of ",
-            ),
-            ({"initializer": "gradient"}, "^initializer must be .*; got 'gradient', which is now in benchmarks/core/"),
-            ({"optimizer": "adam"}, "^optimizer must be .* or 'adan'; got 'adam', which is now in benchmarks/core/"),
+            ({"objective": "l1+ssim"}, "^objective must be .*, which is now in benchmarks/core/"),
             ({"optimizer": object()}, "^optimizer must be 'gaussian-adam' or 'adan'; got "),
             ({"max_seconds": math.inf}, "max_seconds must be a finite number"),
             ({"backend": "gpu"}, "^backend must be one of auto, [^;]*; got 'gpu'$"),
@@ -355,15 +266,14 @@ class TestErrors:
                 make(**settings)
 
 
-class TestThreads:
-    def test_same_bits_with_any_number_of_them(self) -> None:
-        image, labels = disc()
-        before, renders = torch.get_num_threads(), []
-        try:
-            for threads in (1, 2, 3):
-                torch.set_num_threads(threads)
-                renders.append(fit(image, labels, 12, recipe=quick()).scene.render())
-                assert torch.get_num_threads() == threads
-        finally:
-            torch.set_num_threads(before)
-        assert torch.equal(renders[0], renders[1]) and torch.equal(renders[0], renders[2])
+def test_same_bits_with_any_number_of_threads() -> None:
+    image, labels = disc()
+    before, renders = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            renders.append(fit(image, labels, 12, recipe=quick(iterations=20)).scene.render())
+            assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(renders[0], renders[1]) and torch.equal(renders[0], renders[2])

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from scipy.ndimage import distance_transform_edt
-from skimage.measure import label
 from torch import Tensor
 
-from kcgs import GaussianField, RegionMap, Scene, fit
-from kcgs.data import load_image, load_labels
+from kcgs import GaussianField, RegionMap, Scene
 from kcgs.fitting.contour_energy import bounding_boxes, disc, index_map, region_costs
 from kcgs.fitting.contour_loops import MapEnergy, piece_energy
 from kcgs.fitting.contour_moves import refine_contours
-from kcgs.functional import edge_band, psnr, region_splat
+from kcgs.functional import edge_band, region_splat
 
 WIDE = 1e4  # standard deviation in pixels: a Gaussian that is constant over the image
 
@@ -95,22 +92,9 @@ def contour_energy(scene: Scene, image: Tensor, length_weight: float = 0.003, bl
     return float(sum(energies)) + length_weight / 4 * pairs + length_weight * 0.3 * curvature(regions.labels)
 
 
-def small_pieces(labels: Tensor, smallest: int) -> int:
-    pieces = label(labels.numpy() + 1, background=0, connectivity=1)
-    return int((np.bincount(pieces.ravel())[1:] < smallest).sum())
-
-
-def assert_within(labels: Tensor, given: Tensor, distance: float) -> None:
-    """Every pixel's label is in `given` within the distance."""
-    for region in labels.unique().tolist():
-        away = distance_transform_edt((given != region).numpy())
-        assert away[(labels == region).numpy()].max() <= distance + 1e-9
-
-
 class TestEnergy:
-    @pytest.mark.parametrize("seed", range(3))
-    def test_is_the_formula(self, seed: int) -> None:
-        field, image, regions = noisy_problem(seed, torch.float64)
+    def test_is_the_formula(self) -> None:
+        field, image, regions = noisy_problem(1, torch.float64)
         got = contour_energy(Scene(field, regions), image, length_weight=0.02, blur=0.7)
         assert got == pytest.approx(dense_energy(field, image, regions, 0.02, 0.7), rel=1e-9)
 
@@ -123,7 +107,7 @@ class TestEnergy:
         energy = contour_energy(Scene(field, RegionMap(alone)), image, length_weight=1.0)
         assert energy == pytest.approx(2.0 + 0.3 * 12**2)
 
-    @pytest.mark.parametrize("seed", range(24))
+    @pytest.mark.parametrize("seed", range(6))
     def test_never_rises(self, seed: int) -> None:
         field, image, regions = noisy_problem(seed, (torch.float32, torch.float64)[seed % 2])
         settings = {"length_weight": (0.0, 0.003, 0.1)[seed % 3], "blur": (0.0, 0.7, 1.5)[seed % 3]}
@@ -135,20 +119,12 @@ class TestEnergy:
             assert after <= before * (1 + 1e-6)
             assert refined is not regions and after < before
 
-    def test_more_sweeps_lower_it_further(self) -> None:
-        field, image, regions = noisy_problem(4)
-        maps = [
-            refine_contours(Scene(field, regions), image, sweeps=n, smallest=1, max_distance=None) for n in (1, 2, 4)
-        ]
-        energies = [contour_energy(Scene(field, m), image) for m in maps]
-        assert energies[0] > energies[1] > energies[2]
-
     def test_no_single_change_would_lower_it(self) -> None:
         field, image, regions = noisy_problem(1, torch.float64)
         refined = refine_contours(Scene(field, regions), image, smallest=1, max_distance=None, sweeps=100, reach=1)
         lowest = contour_energy(Scene(field, refined), image)
         touched = edge_band(refined.labels, 1).nonzero()
-        for y, x in touched[::7].tolist():
+        for y, x in touched[::15].tolist():
             for region in refined.labels[max(0, y - 1) : y + 2, x].unique().tolist():
                 labels = refined.labels.clone()
                 labels[y, x] = region
@@ -158,47 +134,26 @@ class TestEnergy:
 
 
 class TestMoves:
-    @pytest.mark.parametrize("given", [10, 14])
-    @pytest.mark.parametrize("softness", [0.0, 0.7])
-    def test_onto_the_edge(self, given: int, softness: float) -> None:
-        image = step(12).float()[None].expand(3, -1, -1)
-        field = flat_field({0: [0.0] * 3, 1: [1.0] * 3}, (24, 40))
-        refined = refine_contours(Scene(field, RegionMap(step(given), softness)), image)
-        assert torch.equal(refined.labels, step(12))
-        assert refined.softness == softness
-        assert torch.allclose(Scene(field, refined.labels).render(), image, atol=1e-3)
+    @pytest.mark.parametrize(
+        ("start", "edge", "settings", "calls", "end"),
+        [
+            (10, 12, {}, 1, 12),
+            (14, 12, {}, 1, 12),
+            (12, 20, {"anchor": step(12)}, 4, 15),
+            (12, 30, {"max_distance": None}, 1, 18),  # reach times sweeps
+            (12, 30, {"max_distance": None}, 4, 30),
+        ],
+    )
+    def test_towards_the_edge(self, start: int, edge: int, settings: dict[str, Any], calls: int, end: int) -> None:
+        field, regions = flat_field({0: [0.0], 1: [1.0]}, (24, 40)), RegionMap(step(start), 0.7)
+        for _ in range(calls):
+            regions = refine_contours(Scene(field, regions), step(edge).float()[None], **settings)
+        assert torch.equal(regions.labels, step(end)) and regions.softness == 0.7
 
     def test_a_map_that_is_right_stays(self) -> None:
         regions = RegionMap(step(12))
         field = flat_field({0: [0.0], 1: [1.0]}, (24, 40))
         assert refine_contours(Scene(field, regions), step(12).float()[None]) is regions
-
-    def test_distance_bound_holds_for_repeated_calls(self) -> None:
-        image, given = step(20).float()[None], step(12)
-        field = flat_field({0: [0.0], 1: [1.0]}, (24, 40))
-        regions = RegionMap(given)
-        for _ in range(4):
-            regions = refine_contours(Scene(field, regions), image, anchor=given)
-        assert torch.equal(regions.labels, step(15))
-
-    @pytest.mark.parametrize("distance", [1, 2.3, 3.0, 5])
-    @pytest.mark.parametrize("seed", range(4))
-    def test_distance_bound_on_noise(self, seed: int, distance: float) -> None:
-        field, image, start = noisy_problem(seed)
-        regions = start
-        for _ in range(3):
-            regions = refine_contours(Scene(field, regions), image, anchor=start.labels, max_distance=distance, reach=3)
-            assert_within(regions.labels, start.labels, distance)
-            assert set(regions.ids.tolist()) == set(start.ids.tolist())
-
-    def test_without_bound_it_moves_on(self) -> None:
-        image, regions = step(30).float()[None], RegionMap(step(12))
-        field = flat_field({0: [0.0], 1: [1.0]}, (24, 40))
-        once = refine_contours(Scene(field, regions), image, max_distance=None)
-        assert torch.equal(once.labels, step(18))  # reach times sweeps
-        for _ in range(3):
-            once = refine_contours(Scene(field, once), image, max_distance=None)
-        assert torch.equal(once.labels, step(30))
 
     def test_only_labels_within_reach(self) -> None:
         # the best colour for the middle is that of a region that is far from it
@@ -209,24 +164,10 @@ class TestMoves:
         refined = refine_contours(Scene(field, labels), image, max_distance=None, reach=1, sweeps=2)
         assert refined.labels[5].tolist() == [0] * 8 + [1] * 10 + [2] * 10 + [3] * 12
 
-    def test_same_bits_and_inputs_untouched(self) -> None:
-        field, image, regions = noisy_problem(3)
-        labels, copy = regions.labels.clone(), image.clone()
-        a, b = (refine_contours(Scene(field, regions), image) for _ in range(2))
-        assert torch.equal(a.labels, b.labels)
-        assert torch.equal(regions.labels, labels) and torch.equal(image, copy)
-
     def test_a_region_without_gaussians_is_black(self) -> None:
         field = flat_field({1: [1.0]}, (24, 40))
         refined = refine_contours(Scene(field, RegionMap(step(10))), step(12).float()[None])
         assert torch.equal(refined.labels, step(12))
-
-    def test_opacities_count(self) -> None:
-        flat = flat_field({0: [0.0], 1: [4.0]}, (24, 40))
-        opacities = torch.tensor([1.0, 0.25])
-        field = GaussianField(flat.means, flat.cholesky, flat.colors, flat.region_ids, opacities, size=flat.size)
-        assert torch.equal(refine_contours(Scene(field, RegionMap(step(10))), step(12).float()[None]).labels, step(12))
-
 
 class TestShape:
     def test_specks_that_come_up_are_given_away(self) -> None:
@@ -235,7 +176,7 @@ class TestShape:
         image[:, 14:16, 9:11] = 1.0
         field, regions = flat_field({0: [0.0], 1: [1.0]}, (24, 40)), RegionMap(step(12))
         kept = refine_contours(Scene(field, regions), image, blur=0.0, smallest=1)
-        assert small_pieces(kept.labels, 12) == 2
+        assert (kept.labels != step(12)).sum() == 8
         refined = refine_contours(Scene(field, RegionMap(step(11))), image, blur=0.0)
         assert torch.equal(refined.labels, step(12))
 
@@ -249,15 +190,6 @@ class TestShape:
         want[4:6, 30:33] = 2
         assert torch.equal(refine_contours(Scene(field, labels), image, blur=0.0).labels, want)
 
-    @pytest.mark.parametrize("seed", range(8))
-    def test_no_new_specks_on_noise(self, seed: int) -> None:
-        field, image, regions = noisy_problem(seed)
-        assert small_pieces(regions.labels, 12) == 0
-        free = refine_contours(Scene(field, regions), image, max_distance=None, smallest=1)
-        refined = refine_contours(Scene(field, regions), image, max_distance=None)
-        # what a region must keep may lie in pieces
-        assert small_pieces(refined.labels, 12) < max(1, small_pieces(free.labels, 12) // 4)
-
     @pytest.mark.parametrize("distance", [3.0, None])
     def test_no_region_vanishes(self, distance: float | None) -> None:
         labels = step(20)
@@ -270,29 +202,6 @@ class TestShape:
             kept = [int((refined.labels == region).sum()) for region in (5, 6, 9)]
             assert kept == [1, 2, 12]
             assert refined.labels[3, 3] == 5 and (refined.labels[10:12, 8] == 6).all()
-
-    def test_every_region_of_single_pixels_survives(self) -> None:
-        labels = torch.arange(12).view(3, 4)
-        field = GaussianField.random(40, (3, 4), regions=labels, seed=0)
-        refined = refine_contours(Scene(field, labels), torch.rand(3, 3, 4))
-        assert torch.equal(refined.labels, labels)
-
-    def test_dear_contours_are_short_and_smooth(self) -> None:
-        draw = torch.Generator().manual_seed(0)
-        labels = step(20)
-        labels[::2, 20:22] = 0  # a comb
-        image = (step(20).float() + 0.8 * torch.randn(24, 40, generator=draw))[None]
-        field, regions = flat_field({0: [0.0], 1: [1.0]}, (24, 40)), RegionMap(labels)
-
-        def length(weight: float) -> float:
-            settings = {"blur": 0.0, "smallest": 1, "max_distance": None}
-            refined = refine_contours(Scene(field, regions), image, length_weight=weight, **settings)
-            flat, dark = flat_field({0: [0.0], 1: [0.0]}, (24, 40)), torch.zeros(1, 24, 40)
-            return contour_energy(Scene(flat, refined), dark, length_weight=1.0)
-
-        lengths = [length(weight) for weight in (0.0, 0.3, 3.0)]
-        assert lengths[0] > 1.5 * lengths[1] > 1.5 * lengths[2]
-        assert lengths[2] < 1.2 * (24 + 2 * 23) / 4
 
     def test_bumps_cost_and_thin_legs_do_not(self) -> None:
         labels = step(12)
@@ -309,7 +218,7 @@ class TestShape:
         regions = RegionMap(torch.full((24, 40), 7))
         assert refine_contours(Scene(flat_field({7: [0.3]}, (24, 40)), regions), torch.rand(1, 24, 40)) is regions
 
-    @pytest.mark.parametrize("size", [(1, 2), (1, 9), (9, 1), (2, 2)])
+    @pytest.mark.parametrize("size", [(1, 2), (9, 1)])
     def test_tiny_images(self, size: tuple[int, int]) -> None:
         labels = torch.zeros(size, dtype=torch.long)
         labels[-1, -1] = 1
@@ -329,20 +238,3 @@ class TestShape:
         refined = refine_contours(Scene(field, regions), image, max_distance=5, blur=0.0, length_weight=1e-4)
         assert (refined.labels[10:14, 11:13] == torch.tensor([0, 2])).all()
         assert dict(refined.softness) == {(0, 1): 0.5, (0, 2): 1.0, (1, 2): 1.5}
-
-
-class TestPhoto:
-    def test_a_human_map(self, data_root: Path) -> None:
-        folder = data_root / "bsds" / "253027"
-        if not folder.is_dir():
-            pytest.skip(f"no BSDS photo in {folder}")
-        image, labels = load_image(folder / "image.jpg"), load_labels(folder / "mask.png")
-        field = fit(image, labels, 200, recipe="paper", iterations=60, objective="l2", warmup=False).scene.field
-        regions = RegionMap(labels, 0.7)
-        refined = refine_contours(Scene(field, regions), image)
-        assert contour_energy(Scene(field, refined), image) < 0.99 * contour_energy(Scene(field, regions), image)
-        before, after = (float(psnr(Scene(field, m).render(), image)) for m in (regions, refined))
-        assert after > before + 0.05
-        assert refined.num_regions == regions.num_regions
-        assert small_pieces(refined.labels, 12) <= small_pieces(labels, 12) + 2
-        assert_within(refined.labels, labels, 3.0)

@@ -74,8 +74,7 @@ def dense_filter(planes: Tensor, labels: Tensor, sigma: float) -> tuple[Tensor, 
 
 
 class TestGain:
-    @pytest.mark.parametrize("regions", [None, halves((40, 52))])
-    @pytest.mark.parametrize("channels", [1, 8])
+    @pytest.mark.parametrize(("channels", "regions"), [(1, None), (8, halves((40, 52)))])
     def test_the_definition(self, channels: int, regions: RegionMap | None) -> None:
         """Gains are those of each Gaussian in its region, exact but for blocks, and what a column and a row miss."""
         # error that varies no faster than the Gaussians, as that which they are chosen for
@@ -91,24 +90,20 @@ class TestGain:
             expected = dense_gain(residual, mask, x, y, sigma)
             assert float(gain.max()) == pytest.approx(expected, rel=0.02 if block == 1 else 0.15)
 
-    @pytest.mark.parametrize("size", [(13, 57), (1, 3), (40, 2)])
+    @pytest.mark.parametrize("size", [(13, 57), (1, 3)])
     @pytest.mark.parametrize("has_labels", [False, True])
-    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-    def test_filters_see_one_label_along_columns_and_rows(
-        self, size: tuple[int, int], has_labels: bool, dtype: torch.dtype
-    ) -> None:
+    def test_filters_see_one_label_along_columns_and_rows(self, size: tuple[int, int], has_labels: bool) -> None:
         generator = torch.Generator().manual_seed(0)
-        planes = torch.rand(2, 4, *size, generator=generator).to(dtype)
-        labels = torch.randint(0, 2, (2, *size), generator=generator).to(dtype)
+        planes = torch.rand(2, 4, *size, generator=generator)
+        labels = torch.randint(0, 2, (2, *size), generator=generator).float()
         actual = _gains(planes, labels if has_labels else None, 1.3)
         for k in range(2):
             expected = dense_filter(planes[k].double(), labels[k] if has_labels else torch.zeros(size), 1.3)
-            torch.testing.assert_close([values[k] for values in actual], [values.to(dtype) for values in expected])
+            torch.testing.assert_close([values[k] for values in actual], [values.float() for values in expected])
 
-    @pytest.mark.parametrize("size", [(21, 70), (8, 9)])
-    @pytest.mark.parametrize("block", [2, 4, 8])
-    def test_blocks_are_averaged_over_the_label_of_their_middle(self, size: tuple[int, int], block: int) -> None:
-        generator = torch.Generator().manual_seed(0)
+    @pytest.mark.parametrize("block", [2, 8])
+    def test_blocks_are_averaged_over_the_label_of_their_middle(self, block: int) -> None:
+        generator, size = torch.Generator().manual_seed(0), (21, 30)
         planes = torch.rand(2, 3, *size, generator=generator)
         labels = torch.randint(0, 2, (2, *size), generator=generator)
         averages = _average(planes, labels.float(), block)
@@ -119,19 +114,8 @@ class TestGain:
             is_same = marks == marks[block // 2, block // 2]
             torch.testing.assert_close(averages[image, :, row, column], (values * is_same).mean((1, 2)))
 
-    def test_finds_the_gaussian_that_is_there(self) -> None:
-        mean, cholesky = torch.tensor([[20.5, 14.5]]), torch.tensor([[1.8, 0.0, 1.8]])
-        color = torch.tensor([[0.6, -0.2, 0.1]])
-        residual = region_splat(mean, cholesky, color, size=(32, 48))
-        proposal = propose(residual, None, 1)
-        assert proposal.cholesky.tolist() == cholesky.tolist()
-        assert (proposal.means - mean).abs().max() <= 1
-        torch.testing.assert_close(proposal.colors, color, atol=0.06, rtol=0.1)
-
-
 class TestProposal:
-    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-    @pytest.mark.parametrize("channels", [1, 3, 8])
+    @pytest.mark.parametrize(("channels", "dtype"), [(1, torch.float32), (8, torch.float64)])
     def test_shapes_and_order(self, channels: int, dtype: torch.dtype) -> None:
         residual = noise(channels, (40, 52)).to(dtype)
         proposal = propose(residual, halves((40, 52)), 15)
@@ -140,18 +124,12 @@ class TestProposal:
         assert proposal.region_ids is not None and proposal.region_ids.dtype == torch.int64
         assert propose(residual, None, 3).region_ids is None
 
-    @pytest.mark.parametrize("softness", [0.0, 0.8])
-    @pytest.mark.parametrize("count", [1, 10, 60])
+    @pytest.mark.parametrize(("count", "softness"), [(1, 0.8), (60, 0.0)])
     def test_error_falls(self, count: int, softness: float) -> None:
         residual = noise(3, (60, 72))
         regions = RegionMap(halves((60, 72)).labels, softness)
         left = residual - render(propose(residual, regions, count), regions)
         assert left.square().sum() < residual.square().sum() * (1 - 0.004 * count)
-
-    def test_more_gaussians_leave_less_error(self) -> None:
-        residual = noise(3, (60, 72))
-        left = [float((residual - render(propose(residual, None, n), None)).square().sum()) for n in (5, 20, 80, 320)]
-        assert left == sorted(left, reverse=True)
 
     def test_chosen_at_once_lie_apart(self) -> None:
         residual = noise(1, (96, 96), smooth=5)
@@ -162,11 +140,6 @@ class TestProposal:
             overlap = 2 * float(cholesky[a, 0] * cholesky[b, 0]) / square * np.exp(-0.5 * distance / square)
             assert overlap < 0.3
 
-    def test_same_call_same_bits(self) -> None:
-        residual = noise(3, (60, 72))
-        first, second = (propose(residual, halves((60, 72)), 40) for _ in range(2))
-        assert all(torch.equal(a, b) for a, b in zip(tensors(first), tensors(second), strict=True))
-
     def test_no_graph_and_no_gradient_needed(self) -> None:
         residual = noise(1, (20, 20)).requires_grad_()
         with torch.no_grad():
@@ -175,7 +148,7 @@ class TestProposal:
 
 
 class TestRegions:
-    @pytest.mark.parametrize("size", [(40, 52), (33, 17), (5, 7), (1, 9)])
+    @pytest.mark.parametrize("size", [(33, 17), (1, 9)])
     def test_ids_are_those_under_the_centres(self, size: tuple[int, int]) -> None:
         labels = torch.randint(0, 4, size, generator=torch.Generator().manual_seed(1)) * 3
         regions = RegionMap(labels)
@@ -183,12 +156,6 @@ class TestRegions:
         assert len(means) > 0
         assert (means > 0).all() and (means < means.new_tensor([size[1], size[0]])).all()
         assert torch.equal(lookup_regions(means, labels), ids)
-
-    def test_error_of_one_region_asks_for_nothing_in_another(self) -> None:
-        regions = halves((40, 52))
-        residual = noise(3, (40, 52)) * (regions.labels == 9)
-        proposal = propose(residual, regions, 30)
-        assert proposal.region_ids is not None and set(proposal.region_ids.tolist()) == {9}
 
     def test_one_pixel_region(self) -> None:
         labels = torch.zeros(20, 20, dtype=torch.long)
@@ -211,16 +178,11 @@ class TestRegions:
 
 
 class TestLimits:
-    @pytest.mark.parametrize("regions", [None, halves((20, 30))])
-    def test_no_error_nothing_proposed(self, regions: RegionMap | None) -> None:
-        proposal = propose(torch.zeros(3, 20, 30), regions, 10)
-        assert {len(t) for t in tensors(proposal)} == {0}
-
-    def test_none(self) -> None:
+    def test_nothing_is_proposed_for_no_error_or_no_count(self) -> None:
+        assert len(propose(torch.zeros(3, 20, 30), halves((20, 30)), 10).means) == 0
         assert len(propose(noise(1, (8, 8)), None, 0).means) == 0
 
-    @pytest.mark.parametrize("size", [(1, 1), (1, 9), (5, 7), (17, 33)])
-    @pytest.mark.parametrize("channels", [1, 3, 9])
+    @pytest.mark.parametrize(("size", "channels"), [((1, 1), 1), ((5, 7), 9)])
     def test_small_images(self, size: tuple[int, int], channels: int) -> None:
         """As many Gaussians as pixels, in several rounds, leave less than half of the error, even of noise."""
         residual = noise(channels, size, smooth=1)
@@ -229,14 +191,6 @@ class TestLimits:
             proposal = propose(residual, regions, size[0] * size[1])
             left = residual - render(proposal, regions)
             assert left.square().sum() < 0.5 * residual.square().sum()
-
-    def test_more_than_there_are_places(self) -> None:
-        """Where one pixel alone has an error, rounds go on, and each leaves less."""
-        residual = torch.zeros(1, 20, 30)
-        residual[:, 9, 13] = 1.0
-        proposal = propose(residual, None, 400)
-        left = residual - render(proposal, None)
-        assert 1 <= len(proposal.means) <= 400 and left.square().sum() < 0.05
 
     def test_flat_error_is_filled_evenly(self) -> None:
         residual = torch.full((1, 128, 160), 0.3)
@@ -254,14 +208,13 @@ def test_a_small_region_does_not_stay_black() -> None:
     for k, (row, column) in enumerate([(7, 11), (20, 30), (33, 48)], 1):
         labels[row, column : column + k] = k
         image[:, row, column : column + k] = 0.3 * k
-    scene = fit(image, labels, 30, iterations=120).scene
+    scene = fit(image, labels, 30, iterations=60).scene
     assert (scene.render() - image).abs()[:, labels > 0].max() < 0.1
 
 
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed: pip install triton")
 class TestTriton:
-    @pytest.mark.parametrize("capability", [80, 90])
-    @pytest.mark.parametrize("has_labels", [False, True])
+    @pytest.mark.parametrize(("capability", "has_labels"), [(80, False), (90, True)])
     def test_compiles_without_a_gpu(
         self, capability: int, has_labels: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:

@@ -19,22 +19,22 @@ def psnr_of_first(field: GaussianField, count: int) -> float:
 
 
 def test_the_first_half_shows_the_image_better_than_any_half() -> None:
-    field = fit(photos(), None, 60, iterations=200).scene.field
+    field = fit(photos(), None, 60, iterations=100).scene.field
     ranked = reorder_rows(field, rank_gaussians(field))
     energy = field.colors.square().sum(-1) * field.cholesky[..., ::2].prod(-1)
     by_energy = reorder_rows(field, energy.argsort(descending=True))
     generator = torch.Generator().manual_seed(0)
-    random = reorder_rows(field, torch.rand(4, 60, generator=generator).argsort())
+    random = reorder_rows(field, torch.rand(3, 60, generator=generator).argsort())
     assert psnr_of_first(ranked, 30) > max(psnr_of_first(by_energy, 30), psnr_of_first(random, 30) + 6)
     assert psnr_of_first(ranked, 60) == pytest.approx(psnr_of_first(field, 60), abs=1e-3)
 
 
 @pytest.mark.parametrize("has_maps", [False, True])
 def test_a_batch_is_as_each_image_alone(has_maps: bool) -> None:
-    maps = RegionMap(torch.stack([(torch.arange(56) > x).long().expand(40, 56) for x in (9, 20, 30, 40)]))
-    field = fit(photos(), maps if has_maps else None, 20, iterations=20, move_contours=False).scene.field
+    maps = RegionMap(torch.stack([(torch.arange(56) > x).long().expand(40, 56) for x in (9, 20, 30)]))
+    field = fit(photos(), maps if has_maps else None, 20, iterations=10, move_contours=False).scene.field
     order = rank_gaussians(field, maps if has_maps else None)
-    for k in range(4):
+    for k in range(3):
         alone = rank_gaussians(field[k], maps[k] if has_maps else None)
         assert torch.equal(order[k], alone) and sorted(alone.tolist()) == list(range(20))
 

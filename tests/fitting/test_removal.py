@@ -65,19 +65,17 @@ def test_other_regions_do_not_help() -> None:
     assert removed == [2] and torch.equal(colors[:2], scene.colors[:2])
 
 
-@pytest.mark.parametrize("softness", [None, 0.8])
-def test_colours_of_the_others_lower_the_error(softness: float | None) -> None:
+def test_colours_of_the_others_lower_the_error() -> None:
     generator = torch.Generator().manual_seed(0)
     means = (torch.rand(120, 2, generator=generator) * torch.tensor([60.0, 40.0])).tolist()
-    labels = None if softness is None else (torch.arange(60) >= 30).long().expand(SIZE).contiguous()
+    labels = (torch.arange(60) >= 30).long().expand(SIZE).contiguous()
     scene = RemovalCase(means, torch.randn(120, generator=generator).tolist(), labels)
-    if labels is not None:
-        scene.regions = RegionMap(labels, softness)
+    scene.regions = RegionMap(labels, 0.8)
     removed, _, without, error = scene.remove(15)
     assert len(removed) == 15 and error < 0.8 * without
 
 
-@pytest.mark.parametrize("count", [0, 1, 5])
+@pytest.mark.parametrize("count", [0, 5])
 def test_extremes_are_finite(count: int) -> None:
     scene = RemovalCase([[15, 15]] * 5, [1.0] * 5)
     scene.cholesky[0], scene.cholesky[1] = torch.tensor([1e4, 0.0, 0.1]), torch.tensor([1e-3, 0.0, 1e-3])
@@ -103,7 +101,7 @@ def test_a_batch_is_as_each_image_alone(maps: str | None) -> None:
 class TestFit:
     image = torch.rand(3, 40, 60, generator=torch.Generator().manual_seed(0))
 
-    @pytest.mark.parametrize("stop", [8, 25, 33, 60])
+    @pytest.mark.parametrize("stop", [25, 60])
     def test_no_state_has_more_than_n(self, stop: int) -> None:
         """Wherever a fit is stopped, there are no more Gaussians than asked for, and what is logged is what is kept."""
         result = fit(self.image, None, 50, iterations=60, on_step=lambda iteration, entry: iteration == stop, prune=0.0)

@@ -12,7 +12,6 @@ import torch
 from kcgs import FitConfig, RegionMap
 from kcgs.fitting.contour_moves import accept_moves
 from kcgs.fitting.events import Densify, SettleContours
-from kcgs.fitting.loop import make_schedule
 from kcgs.fitting.problem import make_problem
 from kcgs.fitting.result import HistoryEntry
 from kcgs.fitting.start import make_optimizer, start
@@ -44,22 +43,10 @@ class TestDensify:
         assert min(cycles) == cycles[-1] == 60
         assert set(rest) == {60}
 
-    @pytest.mark.parametrize(("iterations", "cycles"), [(100, 0), (700, 2), (2800, 10)])
+    @pytest.mark.parametrize(("iterations", "cycles"), [(100, 0), (2800, 10)])
     def test_longer_fits_have_more_cycles(self, iterations: int, cycles: int) -> None:
-        counts = targets((p / 10_000 for p in range(4000, 10_000)), iterations=iterations)
+        counts = targets((p / 1000 for p in range(400, 1000)), iterations=iterations)
         assert sum(b > a for a, b in pairwise(counts)) == cycles
-
-    def test_acts_where_the_schedule_asks_for_more(self) -> None:
-        state, densify = state_of(60), Densify()
-        state.progress = 0.05
-        densify.act(state)
-        assert state.num_gaussians == 1  # nothing is measured yet
-        state.history.append(HistoryEntry(0, 0.0, 1.0, 10.0, 10.0, 5))
-        densify.act(state)
-        count = state.num_gaussians
-        assert count > 1
-        densify.act(state)
-        assert state.num_gaussians == count
 
     def test_a_clock_does_not_change_the_number_of_cycles(self) -> None:
         """Iterations of a fit that a clock ends take more and less time."""
@@ -94,24 +81,13 @@ class TestLearningRates:
         assert thrice == pytest.approx([3 * rate for rate in once])
 
 
-class TestEvents:
-    @pytest.mark.parametrize(
-        ("settings", "names"),
-        [
-            ({}, ["TimedAction", "Densify", "SettleContours"]),
-            ({"warmup": True, "move_contours": False}, ["TimedAction", "Warmup", "Densify"]),
-        ],
-    )
-    def test_are_those_of_the_settings(self, settings: dict[str, Any], names: list[str]) -> None:
-        assert [type(event).__name__ for event in make_schedule(state_of(10, **settings))] == names
-
-    def test_late_moves_are_even(self) -> None:
-        state, event, counts = state_of(10), SettleContours(after=0.5), []
-        for p in range(101):
-            state.progress = p / 100
-            event.act(state)
-            counts.append(state.num_late_moves)
-        assert [p / 100 for p in range(1, 101) if counts[p] > counts[p - 1]] == [0.6, 0.7, 0.8, 0.9]
+def test_late_moves_are_even() -> None:
+    state, event, counts = state_of(10), SettleContours(after=0.5), []
+    for p in range(101):
+        state.progress = p / 100
+        event.act(state)
+        counts.append(state.num_late_moves)
+    assert [p / 100 for p in range(1, 101) if counts[p] > counts[p - 1]] == [0.6, 0.7, 0.8, 0.9]
 
 
 class TestMaps:

@@ -36,24 +36,17 @@ def scene(size: tuple[int, int] = (48, 64), channels: int = 3) -> tuple[Tensor, 
 
 @pytest.mark.parametrize("name", START)
 class TestEvery:
-    @pytest.mark.parametrize("channels", [1, 3, 8])
-    @pytest.mark.parametrize("count", [1, 40, 500])
-    def test_counts_shapes_and_ids(self, name: str, count: int, channels: int) -> None:
+    @pytest.mark.parametrize(
+        ("count", "channels", "dtype"), [(1, 3, torch.float32), (40, 1, torch.float64), (500, 8, torch.float32)]
+    )
+    def test_counts_shapes_and_ids(self, name: str, count: int, channels: int, dtype: torch.dtype) -> None:
         image, labels = scene(channels=channels)
         regions = RegionMap(labels)
-        field = START[name](image, count, regions, 0)
+        field = START[name](image.to(dtype), count, regions, 0)
         assert field.num_gaussians == count and field.size == (48, 64) and field.colors.shape == (count, channels)
         assert field.region_ids is not None and bool((regions.index_of(field.region_ids) >= 0).all())
         assert all(torch.isfinite(t).all() for t in (field.means, field.cholesky, field.colors))
-
-    def test_without_regions(self, name: str) -> None:
-        field = START[name](scene()[0], 30, None, 0)
-        assert field.num_gaussians == 30 and field.region_ids is None
-
-    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-    def test_keeps_the_dtype(self, name: str, dtype: torch.dtype) -> None:
-        image, labels = scene()
-        assert START[name](image.to(dtype), 30, RegionMap(labels), 0).colors.dtype == dtype
+        assert field.colors.dtype == dtype
 
     def test_same_seed_same_bits(self, name: str) -> None:
         image, labels = scene()
@@ -66,12 +59,6 @@ class TestEvery:
         labels = torch.tensor([[0, 0, 5], [0, 9, 9]])
         field = START[name](torch.rand(2, 2, 3), 6, RegionMap(labels), 0)
         assert field.num_gaussians == 6 and len(field.means.unique(dim=0)) == 6
-
-    def test_parameters_without_graph_under_any_mode(self, name: str) -> None:
-        image, labels = scene()
-        with torch.no_grad():
-            field = START[name](image, 10, RegionMap(labels), 0)
-        assert all(p.requires_grad and p.is_leaf for p in field.parameters())
 
 
 class TestInitialField:
@@ -92,42 +79,40 @@ class TestInitialField:
     def test_fewer_gaussians_than_regions(self) -> None:
         labels = torch.arange(12).view(3, 4)
         field = initial_field(torch.full((1, 3, 4), 0.5), 5, RegionMap(labels), 0)
-        assert field.num_gaussians == 5
+        assert field.region_ids is not None and len(field.region_ids.unique()) == 5
 
-    @pytest.mark.parametrize("count", [1, 3])
-    @pytest.mark.parametrize("maps", ["none", "one", "each", "float masks", "RegionMap"])
-    def test_a_batch_is_its_images(self, count: int, maps: str) -> None:
+    @pytest.mark.parametrize("maps", ["none", "one", "masks", "RegionMap"])
+    def test_a_batch_is_its_images(self, maps: str) -> None:
         image, labels = scene()
-        images = torch.stack([image.roll(5 * k, -1) for k in range(count)])
-        each = torch.stack([labels.roll(5 * k, -1) for k in range(count)])
-        regions = {
-            "none": None, "one": labels, "each": each, "float masks": each[:, None].float(),
-            "RegionMap": RegionMap(each),
-        }[maps]  # fmt: skip
-        alone = [None if maps == "none" else labels if maps == "one" else each[k] for k in range(count)]
+        images = torch.stack([image.roll(5 * k, -1) for k in range(3)])
+        each = torch.stack([labels.roll(5 * k, -1) for k in range(3)])
+        regions = {"none": None, "one": labels, "masks": each[:, None].float(), "RegionMap": RegionMap(each)}[maps]
+        alone = [None if maps == "none" else labels if maps == "one" else each[k] for k in range(3)]
         batch = initial_field(images, 40, regions, seed=2)
-        assert batch.means.shape == (count, 40, 2)
+        assert batch.means.shape == (3, 40, 2)
         for k, field in enumerate(batch.unbind()):
             expected = initial_field(images[k], 40, alone[k], seed=2)
             assert torch.equal(field.colors, expected.colors) and torch.equal(field.means, expected.means)
             assert field.region_ids is expected.region_ids or torch.equal(field.region_ids, expected.region_ids)  # type: ignore[arg-type]
 
+    def test_parameters_without_a_graph(self) -> None:
+        with torch.no_grad():
+            field = initial_field(scene()[0][None], 10)
+        assert all(p.requires_grad and p.is_leaf for p in field.parameters()) and field.num_images == 1
+
     @pytest.mark.parametrize(
-        ("change", "error", "words"),
+        ("change", "words"),
         [
-            ({"image": torch.zeros(3, 1, 4, 4), "regions": torch.zeros(2, 4, 4).long()}, ValueError,
+            ({"image": torch.zeros(3, 1, 4, 4), "regions": torch.zeros(2, 4, 4).long()},
              r"regions must be one map, or one for each of 3 images, of the image's size \(4, 4\); got \(2, 4, 4\)"),
-            ({"image": torch.zeros(0, 1, 4, 4)}, ValueError, "image must not be empty"),
-            ({"image": 3}, TypeError, "image must be a Tensor"),
-            ({"num_gaussians": 0}, ValueError, "num_gaussians must be at least 1; got 0"),
-            ({"num_gaussians": 50}, ValueError, "num_gaussians must be at most 16"),
-            ({"regions": torch.zeros(5, 4).long()}, ValueError, "regions must be one map of the image's size"),
-            ({"seed": -1}, ValueError, "seed must be in"),
+            ({"image": torch.zeros(0, 1, 4, 4)}, "image must not be empty"),
+            ({"num_gaussians": 50}, "num_gaussians must be at most 16"),
+            ({"seed": -1}, "seed must be in"),
         ],
     )  # fmt: skip
-    def test_bad_input(self, change: dict[str, object], error: type[Exception], words: str) -> None:
+    def test_bad_input(self, change: dict[str, object], words: str) -> None:
         arguments = {"image": torch.zeros(3, 4, 4), "num_gaussians": 2, **change}
-        with pytest.raises(error, match=words):
+        with pytest.raises(ValueError, match=words):
             initial_field(**arguments)  # type: ignore[arg-type]
 
 

@@ -10,8 +10,7 @@ from kcgs.fitting import pursuit
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
-@pytest.mark.parametrize("size", [(13, 57), (1, 3), (40, 2)])
-@pytest.mark.parametrize("num_maps", [0, 1, 3])
+@pytest.mark.parametrize(("size", "num_maps"), [((13, 57), 0), ((13, 57), 3), ((1, 3), 1), ((40, 2), 3)])
 def test_filters_as_compiled_loops(size: tuple[int, int], num_maps: int, monkeypatch: pytest.MonkeyPatch) -> None:
     generator = torch.Generator().manual_seed(0)
     planes = torch.rand(3, 4, *size, generator=generator).to(DEVICE)

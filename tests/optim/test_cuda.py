@@ -21,8 +21,7 @@ NUMBERS = {
 
 
 @pytest.mark.skipif(os.environ.get("TRITON_INTERPRET") == "1", reason="the interpreter does not compile")
-@pytest.mark.parametrize("capability", [80, 90])
-@pytest.mark.parametrize(("opacities", "rate"), [(False, "fp32"), (True, "*fp32")])
+@pytest.mark.parametrize(("capability", "opacities", "rate"), [(80, False, "fp32"), (90, True, "*fp32")])
 def test_compiles_without_a_gpu(
     capability: int, opacities: bool, rate: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,20 +11,6 @@ from kcgs.optim.gaussians import Gaussians, Renderer
 SIZE = (24, 40)
 
 
-@pytest.mark.parametrize("softness", [None, 0.8])
-@pytest.mark.parametrize("backend", ["cpu", "tiled"])
-def test_inner_products_are_those_of_rendered_gaussians(backend: str, softness: float | None) -> None:
-    labels = (torch.arange(40) >= 18).long().expand(SIZE).contiguous()
-    regions = None if softness is None else RegionMap(labels, softness)
-    field = GaussianField.random(30, SIZE, regions=regions, seed=0)
-    gaussians = Gaussians.of(field)
-    # a channel for each Gaussian alone
-    weights = Renderer(SIZE, regions, 0.0, "reference").render(gaussians._replace(colors=torch.eye(30)))
-    expected = (weights.flatten(1) @ weights.flatten(1).T) @ gaussians.colors
-    actual = Renderer(SIZE, regions, 1e-6, backend).inner_products(gaussians)
-    torch.testing.assert_close(actual, expected, atol=1e-3, rtol=1e-4)
-
-
 @pytest.mark.parametrize("regions", [None, RegionMap((torch.arange(40) >= 18).long().expand(SIZE), 0.8)])
 def test_weight_sums_are_those_of_rendered_gaussians(regions: RegionMap | None) -> None:
     fields = [GaussianField.random(30, SIZE, regions=regions, seed=seed) for seed in range(2)]

@@ -75,8 +75,9 @@ class TestMsSsim:
             g = 1e-4 * torch.exp(-0.5 * ((x - 60.5) ** 2 + (y - 90.5) ** 2) / sigma**2).expand(3, -1, -1).double()
             assert float(weight) == pytest.approx(float(objective.value(image + g) / g.square().mean()), rel=0.35)
 
-    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-    @pytest.mark.parametrize("size", [(1, 1), (21, 30), (70, 90)])
+    @pytest.mark.parametrize(
+        ("size", "dtype"), [((1, 1), torch.float32), ((70, 90), torch.float32), ((21, 30), torch.float64)]
+    )
     def test_a_batch_is_as_each_image_alone(self, size: tuple[int, int], dtype: torch.dtype) -> None:
         """In float32, on a CPU, bit for bit: Z is that of each image."""
         images, residuals = (torch.stack([photo(*size, seed=s + k) for k in range(3)]).to(dtype) for s in (0, 5))
@@ -96,7 +97,7 @@ class TestMsSsim:
             ):
                 torch.testing.assert_close(actual, expected, rtol=tolerance, atol=tolerance)
 
-    @pytest.mark.parametrize("size", [(1, 1), (1, 9), (21, 30), (22, 30), (50, 47), (283, 39)])
+    @pytest.mark.parametrize("size", [(1, 9), (22, 30), (283, 39)])
     def test_compiled(self, size: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
         """Float32 is compiled: it agrees with float64, at all sizes and on any number of threads."""
         image, residual = photo(*size), 0.1 * photo(*size, seed=1)
@@ -123,6 +124,6 @@ class TestFit:
         objective = MsSsim(image)
         value: dict[str, float] = {}
         for name in ("l2", "ms-ssim"):
-            render = fit(image, None, 40, iterations=120, objective=name).scene.render().clamp(0, 1)
+            render = fit(image, None, 40, iterations=60, objective=name).scene.render().clamp(0, 1)
             value[name] = float(objective.value(render))
         assert value["ms-ssim"] < value["l2"]

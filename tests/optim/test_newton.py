@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from kcgs import GaussianField
-from kcgs.optim import Gaussians, NewtonDescent, Renderer, SquaredError, self_product
+from kcgs.optim import Gaussians, NewtonDescent, Renderer, SquaredError
 
 SIZE = (32, 40)
 RENDERER = Renderer(SIZE, cutoff=0.0, backend="reference")
@@ -19,13 +19,6 @@ def round_gaussians(sigma: float, colors: list[float], x: float = 20.0) -> Gauss
     cholesky = torch.tensor([[sigma, 0.0, sigma]]).expand(count, 3).double()
     means = torch.tensor([[x + 15 * k, 16.0] for k in range(count)], dtype=torch.float64)
     return Gaussians(means, cholesky.clone(), torch.tensor(colors, dtype=torch.float64)[:, None])
-
-
-def test_the_self_product_is_the_sum_of_squared_weights() -> None:
-    for sigma in (1.0, 2.0, 4.0):
-        gaussians = round_gaussians(sigma, [1.0])
-        weights = RENDERER.render(gaussians)
-        assert float(self_product(gaussians.cholesky)) == pytest.approx(float(weights.square().sum()), rel=1e-3)
 
 
 def test_a_step_of_a_colour_is_the_least_squares_one() -> None:

@@ -67,17 +67,17 @@ def test_takes_the_steps_of_torch_operations(kind: str, launches: list[int]) -> 
     twin = copy.deepcopy(field).double()
     settings: dict[str, Any] = {"min_sigma": 2.0, "bounded": kind == "bounded"}
     optimizers = [GaussianAdam(each, 0.5, **settings) for each in (field, twin)]
-    for step in range(6):
-        if step == 3:
+    for step in range(4):
+        if step == 1:
             for each, optimizer in zip((field, twin), optimizers, strict=True):
                 optimizer.append(each, copy.deepcopy(each))
-        if step == 4:
+        if step == 2:
             for each, optimizer in zip((field, twin), optimizers, strict=True):
                 optimizer.freeze(
                     each, (torch.arange(each.num_gaussians, device=DEVICE) == 5).expand(each.means.shape[:-1])
                 )
         give_gradients(generator, field, twin)
-        rows = [0, 7, 19] + [5] * (step >= 4)
+        rows = [0, 7, 19] + [5] * (step >= 2)
         for each in (field, twin):
             assert each.means.grad is not None and each.colors.grad is not None
             each.means.grad[..., rows[0], 1] = math.nan
@@ -89,31 +89,18 @@ def test_takes_the_steps_of_torch_operations(kind: str, launches: list[int]) -> 
         for value, old in zip(field.parameters(), before, strict=True):
             stays = (value == old).all(-1) if value.ndim == field.means.ndim else value == old
             assert stays[..., rows].all() and bool(stays.all()) != value.requires_grad
-    assert len(launches) == 6
+    assert len(launches) == 4
     for value, expected in zip(field.parameters(), twin.parameters(), strict=True):
         torch.testing.assert_close(value, expected, rtol=1e-5, atol=2e-5, check_dtype=False)
     for value, expected in zip(*map(states, optimizers), strict=True):
         torch.testing.assert_close(value, expected, rtol=1e-5, atol=1e-6, check_dtype=False)
 
 
-def test_a_step_whose_gradients_are_nan_changes_nothing(launches: list[int]) -> None:
-    field = field_of("plain")
-    optimizer = GaussianAdam(field)
-    give_gradients(torch.Generator().manual_seed(2), field)
-    optimizer.step()
-    before = copy.deepcopy([*field.parameters(), *states(optimizer)])
-    for parameter in field.parameters():
-        parameter.grad = torch.full_like(parameter, math.nan)
-    optimizer.step()
-    assert len(launches) == 2
-    assert all(torch.equal(a, b) for a, b in zip(before, [*field.parameters(), *states(optimizer)], strict=True))
-
-
 @pytest.mark.filterwarnings("ignore:overflow")  # numpy's, in the interpreter
 def test_rates_that_overflow_leave_numbers_finite() -> None:
     field, generator = field_of("plain"), torch.Generator().manual_seed(2)
     optimizer = GaussianAdam(field, 1e38, color_lr=3e38)
-    for _ in range(4):
+    for _ in range(2):
         give_gradients(generator, field)
         optimizer.step()
     assert all(parameter.isfinite().all() for parameter in field.parameters())

@@ -35,6 +35,6 @@ def photo(astronaut: Tensor) -> Photo:
 @pytest.fixture(scope="package")
 def scene(photo: Photo) -> Scene:
     image, labels = photo
-    result = fit(image, labels, 300, iterations=150, merge_regions=False)
+    result = fit(image, labels, 300, iterations=100, merge_regions=False)
     assert result.scene.regions is not None
     return result.scene

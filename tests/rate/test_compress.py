@@ -20,19 +20,18 @@ from .conftest import Photo, min_sigma, psnr
 
 
 class TestCompress:
-    @pytest.mark.parametrize("target", [700, 1300])
-    def test_bytes(self, photo: Photo, scene: Scene, target: int) -> None:
+    def test_bytes(self, photo: Photo, scene: Scene) -> None:
         """The file fills its bytes, with less error than one that does not know the image."""
-        compressed = compress(scene, photo[0], target_bytes=target, iterations=150, objective="l2")
-        assert 0.99 * target <= len(compressed.data) <= target
-        plain = decode(encode(scene, target_bytes=target)).scene
+        compressed = compress(scene, photo[0], target_bytes=700, iterations=80, objective="l2")
+        assert 0.99 * 700 <= len(compressed.data) <= 700
+        plain = decode(encode(scene, target_bytes=700)).scene
         assert psnr(plain, photo[0]) + 0.1 < psnr(compressed.scene, photo[0])
         assert torch.equal(compressed.scene.render(), decode(compressed.data).scene.render())
 
     def test_quality(self, photo: Photo, scene: Scene) -> None:
         """A file of the scene's quality is nearly as good as the scene, and a PSNR that the scene has is reached."""
         scene_psnr = psnr(scene, photo[0])
-        quality = compress(scene, photo[0], iterations=200, quality=quality_for(scene_psnr), objective="l2")
+        quality = compress(scene, photo[0], iterations=80, quality=quality_for(scene_psnr), objective="l2")
         assert scene_psnr - 0.3 < psnr(quality.scene, photo[0])
         exact = compress(scene, photo[0], iterations=20, target_psnr=scene_psnr - 0.1)
         assert scene_psnr - 0.1 <= psnr(exact.scene, photo[0])
@@ -43,7 +42,7 @@ class TestCompress:
 
     def test_objective(self, photo: Photo, scene: Scene) -> None:
         images = [
-            compress(scene, photo[0], quality=36, iterations=100, objective=name).scene.render()
+            compress(scene, photo[0], quality=36, iterations=50, objective=name).scene.render()
             for name in ("l2", "ms-ssim")
         ]
         error = MsSsim(photo[0])
@@ -51,13 +50,7 @@ class TestCompress:
 
     def test_least_width(self, photo: Photo, scene: Scene) -> None:
         """The descent keeps to the least width, which rounding changes a little."""
-        assert min_sigma(compress(scene, photo[0], quality=40, iterations=30, min_sigma=2.0).scene) > 1.5
-
-    def test_array(self, photo: Photo, scene: Scene) -> None:
-        """An array is an image, and gives the same bytes."""
-        array = photo[0].permute(1, 2, 0).numpy()
-        expected = compress(scene, photo[0], quality=30, iterations=2)
-        assert compress(scene, array, quality=30, iterations=2).data == expected.data
+        assert min_sigma(compress(scene, photo[0], quality=40, iterations=20, min_sigma=2.0).scene) > 1.5
 
     def test_faint_gaussians(self, photo: Photo, scene: Scene) -> None:
         """They are removed, unless a descent makes them pay."""
@@ -87,7 +80,6 @@ class TestCompress:
                 "objective must be ms-ssim or l2 for a file of a size; got 'l1'",
             ),
             ({"objective": "l1"}, "objective must be l2 or ms-ssim for a file of a PSNR; got 'l1'"),
-            ({"objective": "psnr"}, "objective must be one of .*; got 'psnr', which is now 'l2'"),
             ({"iterations": 0}, "iterations must be at least 1; got 0"),
             ({"quality": 40, "target_bytes": 900}, "quality must be None with target_bytes; got 40"),
             ({"quality": 40, "target_psnr": 30.0}, "target_psnr must be None with quality or target_bytes; got 30"),
@@ -115,14 +107,6 @@ class TestSoftBits:
         estimate = soft_bits(cholesky, colors, quantizer) - soft_bits(new_cholesky, new_colors, quantizer)
         assert saved > 0 and 0.5 * saved < float(estimate.sum()) < 1.6 * saved
 
-    def test_gradients(self) -> None:
-        generator = torch.Generator().manual_seed(0)
-        cholesky = torch.rand(6, 3, generator=generator, dtype=torch.float64) * 4 + 0.8
-        colors = torch.rand(6, 3, generator=generator, dtype=torch.float64) - 0.5
-        quantizer = Quantizer(150, (48, 64))
-        inputs = cholesky.requires_grad_(), colors.requires_grad_()
-        assert torch.autograd.gradcheck(lambda a, b: soft_bits(a, b, quantizer), inputs)
-
     def test_tiny_gaussians_are_no_cheaper(self) -> None:
         cholesky = torch.tensor([[0.1, 0.0, 0.1]], requires_grad=True)
         soft_bits(cholesky, torch.ones(1, 3), Quantizer(150, (48, 64))).sum().backward()
@@ -133,6 +117,6 @@ class TestSoftBits:
         psnrs = []
         for price in (0.0, 0.9):
             monkeypatch.setattr("kcgs.rate.rate_distortion._BIT_PRICE", price)
-            file = compress(scene, photo[0], target_bytes=1100, iterations=200, objective="l2")
+            file = compress(scene, photo[0], target_bytes=1100, iterations=100, objective="l2")
             psnrs.append(psnr(file.scene, photo[0]))
         assert psnrs[0] + 0.05 < psnrs[1]

@@ -13,7 +13,6 @@ from kcgs import FitConfig
 from kcgs.codec import decode
 from kcgs.fitting.problem import Problem, make_problem
 from kcgs.functional import edge_band
-from kcgs.optim.ms_ssim import MsSsim
 from kcgs.rate import fit_bytes, region_choice
 from kcgs.rate.budget import BUDGETS
 from tests.conftest import Clock
@@ -47,7 +46,7 @@ class TestFitBytes:
         image, labels = photo
         psnrs = [10.0]
         for target in (500, 1500):
-            file = fit_bytes(image, labels, target, iterations=150, objective="l2")
+            file = fit_bytes(image, labels, target, iterations=60, objective="l2")
             assert 0.93 * target < len(file.data) <= target
             assert torch.equal(decode(file.data).scene.field.means, file.scene.field.means)
             assert file.result.stop_reason == "iterations"
@@ -56,23 +55,17 @@ class TestFitBytes:
 
     def test_least_width(self, photo: Photo) -> None:
         """A small file is fitted on a reduced photo, has the photo's size, and no thin Gaussians."""
-        file = fit_bytes(photo[0], None, 80, iterations=150)
+        file = fit_bytes(photo[0], None, 80, iterations=30)
         least = 0.12 * ((120 * 160 / BUDGETS["ms-ssim"].num_gaussians(80, 120 * 160)) ** 0.5 - 8)
         assert min_sigma(file.scene) > 0.6 * least  # rounded
         assert file.result.config.min_sigma == pytest.approx(least / 2)
+        assert file.result.config.objective == "ms-ssim"
         assert file.result.scene.size == file.scene.size == (120, 160)
-
-    def test_objective(self, photo: Photo) -> None:
-        """Files raise MS-SSIM unless they are told otherwise."""
-        error = MsSsim(photo[0])
-        files = [fit_bytes(photo[0], None, 600, iterations=100, objective=name) for name in (None, "l2")]
-        values = [error.value(file.scene.render()) for file in files]
-        assert values[0] < 0.95 * values[1]
 
     def test_clock(self, photo: Photo, clock: Clock) -> None:
         """The clock is that of the fit."""
-        file = fit_bytes(*photo, 1500, max_seconds=1.0, iterations=10**7)
-        assert file.result.stop_reason == "seconds" and 0.9 < file.result.seconds < 1.15
+        file = fit_bytes(*photo, 1500, max_seconds=0.5, iterations=10**7)
+        assert file.result.stop_reason == "seconds" and 0.45 < file.result.seconds < 0.6
         assert 0.9 * 1500 < len(file.data) <= 1500
 
     def test_callback(self, photo: Photo) -> None:
@@ -99,7 +92,7 @@ class TestFitBytes:
     ) -> None:
         """Regions stay that pay for their bytes, or that must not be merged."""
         image, labels = problem(photo[0])
-        file = fit_bytes(image, labels, target, iterations=100, **settings)
+        file = fit_bytes(image, labels, target, iterations=50, **settings)
         regions, report = file.scene.regions, file.result.regions
         assert len(file.data) <= target and psnr(file.scene, image) > min_psnr
         assert (1 if regions is None else regions.num_regions) == num_regions

@@ -15,7 +15,7 @@ from kcgs.functional import psnr
 from kcgs.video import delete_from_video, fit_video, interpolate, move_in_video
 
 SIZE = (48, 64)
-SETTINGS: dict[str, Any] = {"num_gaussians": 80, "iterations": 300}
+SETTINGS: dict[str, Any] = {"num_gaussians": 80, "iterations": 200}
 
 
 Y, X = torch.meshgrid(torch.arange(SIZE[0]) + 0.5, torch.arange(SIZE[1]) + 0.5, indexing="ij")
@@ -39,8 +39,8 @@ def scenes() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def every_second() -> Scene:
-    return fit_video(FRAMES[::2], MAPS[::2], **SETTINGS)
+def moved(scenes: Scene) -> Scene:
+    return move_in_video(scenes, 7, (10, 8))
 
 
 class TestFitVideo:
@@ -70,49 +70,53 @@ class TestFitVideo:
         """Contours have the softness of the first frame before and after a cut, in the batch and in each frame."""
         thirds = torch.arange(SIZE[1]) // 22
         other = torch.stack([0.9 * (thirds == k) for k in range(3)])[:, None].expand(3, *SIZE).contiguous()
-        frames, maps = [*FRAMES[:2], other, other], [*MAPS[:2], thirds.expand(SIZE), thirds.expand(SIZE)]
+        frames, maps = [FRAMES[0], other, other], [MAPS[0], thirds.expand(SIZE), thirds.expand(SIZE)]
         rendered: list[Tensor] = []
-        whole = fit_video(frames, maps, on_frame=lambda _, scene: rendered.append(scene.render()), **SETTINGS)
+        settings = {"num_gaussians": 40, "iterations": 40, "on_frame": lambda _, scene: rendered.append(scene.render())}
+        whole = fit_video(frames, maps, **settings)
         assert torch.allclose(whole.render(), torch.stack(rendered), atol=1e-5)
 
     def test_scene_cut(self) -> None:
         """A map of the first frame moves along until a cut; another shot is fitted anew, without it."""
         other = torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(0)).mul(0.1)
         other[0, :, 30:] = 0.9
-        frames = [*FRAMES, other, other]
-        scenes = fit_video(frames, MAPS[0], **SETTINGS)
+        frames = [*FRAMES[:3], other, other]
+        scenes = fit_video(frames, MAPS[0], 80, iterations=100)
         assert scenes.regions is not None
-        assert [len(labels.unique()) for labels in scenes.regions.labels] == [2, 2, 2, 2, 2, 1, 1]
-        disc = scenes.regions.labels[4] == 7
-        assert (disc & (MAPS[4] == 7)).sum() > 0.65 * (disc | (MAPS[4] == 7)).sum()
+        assert [len(labels.unique()) for labels in scenes.regions.labels] == [2, 2, 2, 1, 1]
+        disc = scenes.regions.labels[2] == 7
+        assert (disc & (MAPS[2] == 7)).sum() > 0.65 * (disc | (MAPS[2] == 7)).sum()
         assert min(float(psnr(scene.render(), frame)) for scene, frame in zip(scenes, frames, strict=True)) > 24
 
     def test_regions_come_and_go(self) -> None:
         empty = torch.zeros_like(MAPS[0])
-        scenes = fit_video([FRAMES[0]] * 3, [empty, MAPS[0], empty], 80, iterations=150)
+        scenes = fit_video([FRAMES[0]] * 3, [empty, MAPS[0], empty], 80, iterations=80)
         assert scenes.regions is not None and scenes.regions.ids.tolist() == [0, 7]
-        assert float(psnr(scenes[1].render(), FRAMES[0])) > 27
+        assert float(psnr(scenes[1].render(), FRAMES[0])) > 26
 
-    @pytest.mark.parametrize("settings", [{}, {"guidance": False}, {"objective": "ms-ssim"}])
+    @pytest.mark.parametrize("settings", [{"guidance": False}, {"objective": "ms-ssim"}])
     def test_without_regions(self, settings: dict[str, Any]) -> None:
         maps = MAPS if "guidance" in settings else None
         scenes = fit_video(FRAMES[:2], maps, 20, iterations=10, **settings)
         assert scenes.regions is None and scenes.field.region_ids is None and len(scenes) == 2
 
     @pytest.mark.parametrize(
-        ("frames", "maps", "match"),
+        ("frames", "maps", "settings", "match"),
         [
-            ([], None, "frames must hold at least one frame; got none"),
-            (FRAMES, MAPS[:1], "label_maps must have a map for each frame, or be one map; got 1 for 5 frames"),
-            (iter(FRAMES), iter(MAPS[:1]), "label_maps must have a map for each frame, or be one map; got 1"),
-            ([FRAMES[0], FRAMES[0][:, :24]], None, r"frame 1 must have shape \(3, 48, 64\); got \(3, 24, 64\)"),
+            ([], None, {}, "frames must hold at least one frame; got none"),
+            (FRAMES, MAPS[:1], {}, "label_maps must have a map for each frame, or be one map; got 1 for 5 frames"),
+            (iter(FRAMES), iter(MAPS[:1]), {}, "label_maps must have a map for each frame, or be one map; got 1"),
+            ([FRAMES[0], FRAMES[0][:, :24]], None, {}, r"frame 1 must have shape \(3, 48, 64\); got \(3, 24, 64\)"),
+            (FRAMES, None, {"bounded": True}, "bounded must be False for a video; got True"),
         ],
     )
-    def test_exceptions(self, frames: list[Tensor], maps: list[Tensor] | None, match: str) -> None:
+    def test_exceptions(
+        self, frames: list[Tensor], maps: list[Tensor] | None, settings: dict[str, Any], match: str
+    ) -> None:
         with pytest.raises(ValueError, match=match):
-            fit_video(frames, maps, 8, iterations=2)
+            fit_video(frames, maps, 8, iterations=2, **settings)
 
-    @pytest.mark.parametrize("size", [(1, 5), (5, 1), (2, 2)])
+    @pytest.mark.parametrize("size", [(1, 5), (5, 1)])
     def test_tiny_frames(self, size: tuple[int, int]) -> None:
         frames = torch.rand(2, 3, *size, generator=torch.Generator().manual_seed(0))
         assert fit_video(frames, None, 3, iterations=5).render().shape == (2, 3, *size)
@@ -123,16 +127,13 @@ class TestFitVideo:
         factors = torch.stack([l11, torch.zeros_like(l11), l21, l22], -1).view(-1, 2, 2)
         assert torch.linalg.svdvals(factors).min() > 1.999
 
-    def test_bounded(self) -> None:
-        with pytest.raises(ValueError, match="bounded must be False for a video; got True"):
-            fit_video(FRAMES, None, 8, iterations=2, bounded=True)
-
 
 class TestInterpolate:
     @pytest.mark.parametrize("number", [0, 1])
-    def test_error(self, every_second: Scene, number: int) -> None:
+    def test_error(self, scenes: Scene, number: int) -> None:
         """It is 2 dB lower than that of the mean of the frames, where something moves."""
         image, labels = moving_disc(2.0 * number + 1)
+        every_second = scenes[::2]
         renders = interpolate(every_second, number + 0.5).render(), every_second[number : number + 2].render().mean(0)
         errors = [(render - image)[:, labels == 7].square().mean() for render in renders]
         assert errors[0] < 0.63 * errors[1]
@@ -164,8 +165,7 @@ class TestEdits:
             pixels = (MAPS[number] == 7) & ~dilate(MAPS[other] == 7, 4)
             assert (edited[number].render() - GROUND)[:, pixels].square().mean() < 1e-4
 
-    def test_move(self, scenes: Scene) -> None:
-        moved = move_in_video(scenes, 7, (10, 8))
+    def test_move(self, scenes: Scene, moved: Scene) -> None:
         assert moved.regions is not None
         labels = moved.regions.labels[2]
         assert torch.equal(labels[8:, 10:] == 7, (scenes.regions.labels[2] == 7)[:-8, :-10])  # type: ignore[union-attr]
@@ -173,16 +173,16 @@ class TestEdits:
         difference = moved[2].render()[:, 8:, 10:] - scenes[2].render()[:, :-8, :-10]
         assert difference[:, inside[8:, 10:]].abs().mean() < 0.02
 
-    def test_a_frame_moves_as_an_image_does(self, scenes: Scene) -> None:
-        """To the same map, with the same softness, and a loss is said."""
-        moved, image = move_in_video(scenes, 7, (10, 8)), move_region(scenes[2], 7, (10, 8))
+    def test_a_frame_moves_as_an_image_does(self, scenes: Scene, moved: Scene) -> None:
+        image = move_region(scenes[2], 7, (10, 8))
         assert moved.regions is not None and image.regions is not None
         assert torch.equal(moved.regions.labels[2], image.regions.labels)
         assert moved.regions[2].softness == image.regions.softness
-        for move, each in ((move_in_video, scenes), (move_region, scenes[2])):
-            with pytest.warns(UserWarning, match="regions 7 are lost: covered, or out of the image"):
-                moved = move(each, 7, (100, 0))
-            moved.render()  # without a warning of rows whose region has no pixels
+
+    def test_a_lost_region_is_told(self, scenes: Scene) -> None:
+        with pytest.warns(UserWarning, match="regions 7 are lost: covered, or out of the image"):
+            moved = move_in_video(scenes[:2], 7, (100, 0))
+        moved.render()  # without a warning of rows whose region has no pixels
 
     def test_recolor(self, scenes: Scene) -> None:
         """All frames at once: the disc of each gets the same gain and bias."""
