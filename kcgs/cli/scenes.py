@@ -112,22 +112,20 @@ def info(scene: SceneFile, as_json: Json = False) -> None:
     """
     from kcgs import load
     from kcgs._repr import shorten
+    from kcgs.maps import mean_softness
 
     if (labels := _read_map(scene)) is not None:
         print_report(_describe_map(scene, labels), as_json, str(scene))
         return
 
     loaded = load(scene)
-    softness = 0.0 if loaded.regions is None else loaded.regions.softness
-    parts = softness if isinstance(softness, tuple) else (softness,)
-    means = [part if isinstance(part, float) else sum(part.values()) / max(1, len(part)) for part in parts]
     report: dict[str, Any] = {
         "images": loaded.num_images or 1,
         **describe_scene(loaded),
         "channels": loaded.field.colors.shape[-1],
         "height": loaded.size[0],
         "width": loaded.size[1],
-        "softness": sum(means) / len(means),
+        "softness": 0.0 if loaded.regions is None else mean_softness(loaded.regions.softness),
         **describe_file(scene, scene.stat().st_size, loaded.size),
         **{f"metadata.{key}": value if as_json else shorten(value) for key, value in loaded.metadata.items()},
     }

@@ -9,7 +9,15 @@ import torch
 
 from kcgs._check import check_count
 from kcgs.errors import InvalidArgument
-from kcgs.maps import PairSoftness, RegionMap, nearest_labels, touching_pairs
+from kcgs.maps import (
+    PairSoftness,
+    RegionMap,
+    largest_softness,
+    nearest_labels,
+    softness_between,
+    softness_of_map,
+    touching_pairs,
+)
 from kcgs.nn import GaussianField, join, scaled_gaussians
 from kcgs.scene import Scene, check_scene
 
@@ -90,9 +98,7 @@ def move_region(
 
 def _contour_reach(regions: RegionMap) -> int:
     """Return the distance from a contour, in pixels, within which the background of a region is visible."""
-    softness = _softness_of_one(regions)
-    largest = softness if isinstance(softness, float) else max(softness.values(), default=0.0)
-    return math.ceil(1.0 + _CONTOUR_SIGMAS * largest)
+    return math.ceil(1.0 + _CONTOUR_SIGMAS * largest_softness(softness_of_map(regions.softness)))
 
 
 def delete_region(scene: Scene, region_ids: int | Iterable[int], *, fill: bool = True, margin: int = MARGIN) -> Scene:
@@ -170,7 +176,7 @@ def replace_background(scene: Scene, region_ids: int | Iterable[int], background
         background_map = background.regions.resize(scene.size)
         background_labels = background_map.labels.to(ids.device) + first_id
         ids = other.region_ids.to(ids.device) + first_id
-        softness = _softness_of_one(background_map)
+        softness = softness_of_map(background_map.softness)
     labels = torch.where(pixels, background_labels, regions.labels)
     new_map = _with_softness(regions.relabel(labels, "mean"), softness, first_id)
     means, cholesky, colors = (t.to(field.means) for t in (*scaled_gaussians(other, scene.size), other.merged_colors()))
@@ -178,26 +184,15 @@ def replace_background(scene: Scene, region_ids: int | Iterable[int], background
     return Scene(new_field.subset(members_of(new_field, labels)), new_map, scene.metadata)
 
 
-def _softness_of_one(regions: RegionMap) -> float | PairSoftness:
-    """Return the softness of a map without a batch."""
-    softness = regions.softness
-    assert not isinstance(softness, tuple)
-    return softness
-
-
 def _with_softness(regions: RegionMap, softness: float | PairSoftness | None, first_id: int) -> RegionMap:
     """Give contours between regions with ids from `first_id` on the softness of a map where these ids began at 0."""
-    before = _softness_of_one(regions)
+    before = softness_of_map(regions.softness)
     if softness is None or softness == before:
         return regions
-
-    def width(softness: float | PairSoftness, a: int, b: int) -> float:
-        return softness if isinstance(softness, float) else softness.get((a, b), 0.0)
-
-    return RegionMap(
-        regions.labels,
-        {
-            (a, b): width(before, a, b) if min(a, b) < first_id else width(softness, a - first_id, b - first_id)
-            for a, b in touching_pairs(regions.labels)
-        },
-    )
+    pairs = {
+        (a, b): softness_between(before, a, b)
+        if a < first_id
+        else softness_between(softness, a - first_id, b - first_id)
+        for a, b in touching_pairs(regions.labels)
+    }
+    return RegionMap(regions.labels, pairs)
