@@ -18,11 +18,12 @@ from kcgs.errors import InvalidArgument
 
 from . import options
 from .commands import app
-from .common import INTERRUPTED, Json, Quiet, print_report
-from .fit import file_config
+from .common import INTERRUPTED, Json, Quiet
 from .many_batches import make_batches, run_batch, takes_one_image
 from .many_jobs import FitJob, Outcome
 from .many_shards import Shards
+from .reports import print_report
+from .saving import file_config
 
 
 def _check_batch(value: str) -> str:

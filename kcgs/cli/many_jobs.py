@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from kcgs._atomic import write_file
 
-from .common import describe_error, replace_undefined
-from .fit import SavedFit, fit_and_save, read_regions, report_fit, save_result
-from .options import FitRequest
+from .common import describe_error
+from .options import FitRequest, read_regions
+from .reports import replace_undefined, report_fit
+from .saving import SavedFit, fit_and_save, save_result
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -10,8 +10,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from .common import describe_error, replace_undefined
+from .common import describe_error
 from .many_jobs import FileBatch, FitJob, Loaded, Outcome, describe_settings, fit_batch, load_job
+from .reports import replace_undefined
 
 
 class ShardPart(NamedTuple):

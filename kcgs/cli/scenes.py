@@ -14,17 +14,9 @@ from kcgs._progress import Progress
 from kcgs._suffixes import SCENES, VIDEOS, WRITTEN_IMAGES
 
 from .commands import app
-from .common import (
-    ImageFile,
-    Json,
-    Quiet,
-    SceneFile,
-    SceneOrMap,
-    check_output,
-    print_report,
-)
-from .fit import describe_file, describe_scene, read_regions
-from .options import Objective, ResizeRegions, Threshold, exclude, target_size
+from .common import ImageFile, Json, Quiet, SceneFile, SceneOrMap, check_output
+from .options import Objective, ResizeRegions, Threshold, exclude, read_regions, target_size
+from .reports import describe_file, describe_scene, print_report
 
 if TYPE_CHECKING:
     from torch import Tensor
