@@ -9,15 +9,7 @@ import torch
 
 from kcgs._check import check_count
 from kcgs.errors import InvalidArgument
-from kcgs.maps import (
-    PairSoftness,
-    RegionMap,
-    largest_softness,
-    nearest_labels,
-    softness_between,
-    softness_of_map,
-    touching_pairs,
-)
+from kcgs.maps import RegionMap, largest_softness, nearest_labels, softness_between, softness_of_map, touching_pairs
 from kcgs.nn import GaussianField, join, scaled_gaussians
 from kcgs.scene import Scene, check_scene
 
@@ -171,28 +163,27 @@ def replace_background(scene: Scene, region_ids: int | Iterable[int], background
     first_id = int(regions.ids.max()) + 1
     background_labels = torch.full_like(regions.labels, first_id)
     ids = background_labels.new_full((other.num_gaussians,), first_id)
-    softness: float | PairSoftness | None = None
+    background_map: RegionMap | None = None
     if background.regions is not None and other.region_ids is not None:
         background_map = background.regions.resize(scene.size)
         background_labels = background_map.labels.to(ids.device) + first_id
         ids = other.region_ids.to(ids.device) + first_id
-        softness = softness_of_map(background_map.softness)
     labels = torch.where(pixels, background_labels, regions.labels)
-    new_map = _with_softness(regions.relabel(labels, "mean"), softness, first_id)
+    new_map = _with_softness(regions.relabel(labels, "mean"), background_map, first_id)
     means, cholesky, colors = (t.to(field.means) for t in (*scaled_gaussians(other, scene.size), other.merged_colors()))
     new_field = join(field.subset(~members), GaussianField(means, cholesky, colors, ids, size=scene.size))
     return Scene(new_field.subset(members_of(new_field, labels)), new_map, scene.metadata)
 
 
-def _with_softness(regions: RegionMap, softness: float | PairSoftness | None, first_id: int) -> RegionMap:
-    """Give contours between regions with ids from `first_id` on the softness of a map where these ids began at 0."""
-    before = softness_of_map(regions.softness)
-    if softness is None or softness == before:
+def _with_softness(regions: RegionMap, background: RegionMap | None, first_id: int) -> RegionMap:
+    """Give contours between ids from `first_id` on the softness of the background, whose ids begin at 0."""
+    if background is None:
+        return regions
+    old, new = softness_of_map(regions.softness), softness_of_map(background.softness)
+    if new == old:
         return regions
     pairs = {
-        (a, b): softness_between(before, a, b)
-        if a < first_id
-        else softness_between(softness, a - first_id, b - first_id)
+        (a, b): softness_between(old, a, b) if a < first_id else softness_between(new, a - first_id, b - first_id)
         for a, b in touching_pairs(regions.labels)
     }
     return RegionMap(regions.labels, pairs)
