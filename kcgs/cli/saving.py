@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from kcgs._atomic import write_file
-from kcgs._objectives import Purpose
 from kcgs._progress import Progress
 
 from .options import FitRequest
@@ -67,9 +66,13 @@ def file_config(output: Path, request: FitRequest) -> FitConfig:
     """
     from kcgs.fitting import config_for
 
-    purpose: Purpose = "file of a PSNR" if request.target_bytes is None else "file of a size"
-    config = config_for(purpose if output.suffix == ".kcgs" else "fit", request.load_config())
-    if output.suffix != ".kcgs" or request.target_bytes is not None or config.target_psnr is None:
+    config = request.load_config()
+    if output.suffix != ".kcgs":
+        return config_for("fit", config)
+    if request.target_bytes is not None:
+        return config_for("file of a size", config)
+    config = config_for("file of a PSNR", config)
+    if config.target_psnr is None:
         return config
     return config.model_copy(update={"target_psnr": config.target_psnr + _ROUNDING_MARGIN})
 

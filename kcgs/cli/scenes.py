@@ -125,9 +125,9 @@ def info(scene: SceneFile, as_json: Json = False) -> None:
         table = _describe_regions(loaded)
         if as_json:
             report["table"] = table
-        for row in () if as_json else table:
-            facts = "{area} pixels, one at {x}, {y}; mean {color}".format_map(row)
-            report[f"region {row['id']}"] = facts
+        else:
+            facts = "{area} pixels, one at {x}, {y}; mean {color}"
+            report |= {f"region {row['id']}": facts.format_map(row) for row in table}
     print_report(report, as_json, str(scene))
 
 
@@ -173,9 +173,8 @@ def encode(
 
     loaded = load(scene)
     target = None if image is None else _load_like(loaded, image)
-    goal: dict[str, Any] = {"quality": quality, "target_bytes": target_bytes}
     with Progress("writing the file", pulse=True, visible=not quiet):
-        num_bytes = loaded.save(output, image=target, **goal, objective=objective)
+        num_bytes = loaded.save(output, image=target, quality=quality, target_bytes=target_bytes, objective=objective)
     rounded = load(output)
     report = {
         "psnr_to_scene": float(psnr(rounded.render(), loaded.render())),
