@@ -1,10 +1,8 @@
-"""Shared parts of the commands: arguments, reports, Ctrl-C."""
+"""Shared parts of the commands: arguments, checks of outputs, errors, Ctrl-C."""
 
 from __future__ import annotations
 
-import json
 import logging
-import math
 import signal
 from pathlib import Path
 from typing import Annotated, Any
@@ -72,34 +70,6 @@ def check_new(path: Path, overwrite: bool) -> None:
     """Refuse an output that exists, before the work starts, unless it may be replaced."""
     if path.exists() and not overwrite:
         raise FileExistsError(f"{path} exists; --overwrite replaces it")
-
-
-def replace_undefined(report: dict[str, Any]) -> dict[str, Any]:
-    """Replace NaN and infinity by None: JSON has no such numbers."""
-    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in report.items()}
-
-
-def _explain_undefined(name: str) -> str:
-    """Return the reason why a metric of `evaluate` is not defined."""
-    from kcgs.functional import METRICS
-
-    return f"not defined: {METRICS[name].undefined}" if name in METRICS else "not defined"
-
-
-def print_report(report: dict[str, Any], as_json: bool, title: str) -> None:
-    """Print a table, or one JSON object."""
-    if as_json:
-        typer.echo(json.dumps(replace_undefined(report)))
-        return
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table("", title)
-    for key, value in report.items():
-        if value is not None:
-            text = f"{value:.4g}" if isinstance(value, float) else str(value)
-            table.add_row(key, _explain_undefined(key) if text == "nan" else text)
-    Console(markup=False).print(table)
 
 
 def describe_error(error: Exception) -> str:

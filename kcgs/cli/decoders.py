@@ -10,9 +10,9 @@ import typer
 from kcgs._atomic import write_file
 
 from .commands import app
-from .common import Json, SceneFile, check_output, print_report
-from .fit import describe_scene
+from .common import Json, SceneFile, check_output
 from .options import exclude
+from .reports import describe_scene, print_report
 
 
 @app.command()

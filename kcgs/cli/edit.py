@@ -13,9 +13,9 @@ from kcgs._suffixes import SCENES
 from kcgs.errors import InvalidArgument
 
 from .commands import app
-from .common import Json, SceneFile, check_output, print_report
-from .fit import describe_file, describe_scene
+from .common import Json, SceneFile, check_output
 from .options import exclude
+from .reports import describe_file, describe_scene, print_report
 
 if TYPE_CHECKING:
     from kcgs.scene import Scene

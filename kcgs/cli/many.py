@@ -18,11 +18,13 @@ from kcgs.errors import InvalidArgument
 
 from . import options
 from .commands import app
-from .common import INTERRUPTED, Json, Quiet, print_report
-from .fit import file_config
-from .many_batches import make_batches, run_batch, takes_one_image
-from .many_jobs import FitJob, Outcome
+from .common import INTERRUPTED, Json, Quiet
+from .many_batches import make_batches, run_batch, single_image_option
+from .many_fingerprints import FitJob
+from .many_jobs import Outcome
 from .many_shards import Shards
+from .reports import print_report
+from .saving import file_config
 
 
 def _check_batch(value: str) -> str:
@@ -108,7 +110,7 @@ def fit_many_command(
     from kcgs.engine import run_jobs
 
     file_config(jobs[0].output, request)  # refuses wrong settings before the work
-    single = takes_one_image(request)
+    single = single_image_option(request)
     if single is not None and batch not in ("auto", "1"):
         options.exclude(f"--{single}", batch=batch)
     devices = _list_devices(request) if engine == "local" else [request.device]

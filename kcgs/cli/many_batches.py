@@ -6,8 +6,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from .many_jobs import FileBatch, FitJob, Outcome
-from .many_shards import ShardPart, fingerprint_of
+from .many_fingerprints import FitJob, fingerprint_of_shard
+from .many_jobs import FileBatch, Outcome
+from .many_shards import ShardPart
 from .options import FitRequest
 
 # pixels of a batch: more would not fit into the cache of a core; a GPU is fully used from this number on
@@ -30,7 +31,7 @@ def run_batch(batch: Batch) -> list[Outcome]:
     return batch.work.run()
 
 
-def takes_one_image(request: FitRequest) -> str | None:
+def single_image_option(request: FitRequest) -> str | None:
     """Return the option that makes a request fit images one by one; None: images may be fitted together."""
     config = request.load_config()
     values = {
@@ -52,6 +53,8 @@ def make_batches(
         devices: batches are spread over the devices in turn.
         output: folder of the shards.
     """
+    from kcgs.data import shard_path
+
     groups = _by_size(jobs) if batch != "1" or shard is not None else {None: [*range(len(jobs))]}
     on_gpu = devices[0].startswith("cuda")
     batches: list[Batch] = []
@@ -60,13 +63,13 @@ def make_batches(
         count = _auto_batch(size, len(indices), workers, on_gpu) if batch == "auto" else int(batch)
         for members in _chunks(indices, shard or len(indices)):
             parts = [*_chunks(members, count)]
-            fingerprint = "" if shard is None else fingerprint_of([jobs[index] for index in members])
+            fingerprint = "" if shard is None else fingerprint_of_shard([jobs[index] for index in members])
             for number, part in enumerate(parts):
                 device = devices[len(batches) % len(devices)]
                 chosen = tuple(jobs[k]._replace(request=jobs[k].request._replace(device=device)) for k in part)
                 work: FileBatch | ShardPart = FileBatch(chosen)
                 if shard is not None:
-                    work = ShardPart(_shard_path(output, num_shards), number, chosen, size, fingerprint)
+                    work = ShardPart(shard_path(output.absolute(), num_shards), number, chosen, size, fingerprint)
                 batches.append(Batch(tuple(part), work))
             num_shards += 1
     return batches
@@ -96,9 +99,3 @@ def _auto_batch(size: Size | None, count: int, workers: int, on_gpu: bool) -> in
 
 def _chunks(items: Sequence[int], count: int) -> Iterator[Sequence[int]]:
     return (items[first : first + count] for first in range(0, len(items), count))
-
-
-def _shard_path(output: Path, number: int) -> Path:
-    from kcgs.data import shard_path
-
-    return shard_path(output.absolute(), number)

@@ -2,39 +2,20 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import warnings
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from kcgs._atomic import write_file
-
-from .common import describe_error, replace_undefined
-from .fit import SavedFit, fit_and_save, read_regions, report_fit, save_result
-from .options import FitRequest
+from .common import describe_error
+from .many_fingerprints import FitJob, existing_row, fingerprint_of, is_done, mark_started, write_row
+from .options import FitRequest, read_regions
+from .reports import replace_undefined, report_fit
+from .saving import SavedFit, fit_and_save, save_result
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from kcgs.fitting import FitResult
-
-
-class FitJob(NamedTuple):
-    """An image to be fitted, and the options of its fit."""
-
-    image: Path
-    output: Path
-    """File of the scene; its row of results.csv is in a JSON file beside it."""
-    regions: str
-    """auto, none, or the path of the mask."""
-    request: FitRequest
-    overwrite: bool = False
-    """Replace a scene that has another image, mask or settings, or that was changed since."""
-    resize_regions: bool = False
-    threshold: float | None = None
-    """Threshold of masks with soft edges."""
 
 
 class Outcome(NamedTuple):
@@ -70,12 +51,30 @@ class FileBatch(NamedTuple):
     images: tuple[FitJob, ...]
 
     def run(self) -> list[Outcome]:
-        """Fit the images whose scenes do not exist."""
-        return fit_jobs(self.images)
+        """Fit the images, those of one shape together, and write their scenes and rows, unless both exist unchanged.
+
+        An error of one image is returned; it does not stop the other images.
+        """
+        outcomes: dict[int, Outcome] = {}
+        groups: dict[Any, dict[int, tuple[Loaded, str]]] = {}
+        for index, job in enumerate(self.images):
+            try:
+                fingerprint = fingerprint_of(job)
+                if (row := existing_row(job, fingerprint)) is not None:
+                    outcomes[index] = Outcome(row, False)
+                    continue
+                loaded = load_job(job)
+                mark_started(job, fingerprint)
+                groups.setdefault((loaded.image.shape, loaded.labels is None), {})[index] = loaded, fingerprint
+            except Exception as error:
+                outcomes[index] = failure(error)
+        for group in groups.values():
+            outcomes |= _fit_group(self.images, group)
+        return [outcomes[index] for index in range(len(self.images))]
 
     def count_done(self) -> int:
         """Count the images whose scenes and rows exist, from the same image, mask and settings."""
-        return sum(map(_is_done, self.images))
+        return sum(map(is_done, self.images))
 
 
 def load_job(job: FitJob) -> Loaded:
@@ -117,30 +116,6 @@ def _warnings_of(result: FitResult, count: int) -> tuple[str, ...]:
     return tuple(messages)
 
 
-def fit_jobs(jobs: Sequence[FitJob]) -> list[Outcome]:
-    """Fit images, those of the same shape together; write the scene and the row of each, unless both exist unchanged.
-
-    An error of one image is returned; it does not stop the other images.
-    """
-    outcomes: dict[int, Outcome] = {}
-    groups: dict[Any, dict[int, tuple[Loaded, str]]] = {}
-    for index, job in enumerate(jobs):
-        try:
-            fingerprint = _fingerprint(job)
-            if (row := _existing_row(job, fingerprint)) is not None:
-                outcomes[index] = Outcome(row, False)
-                continue
-            loaded = load_job(job)
-            # if the command is killed between scene and row, the next run recognizes the scene as its own
-            write_file(job.output.with_suffix(".json"), json.dumps({"fingerprint": fingerprint}))
-            groups.setdefault((loaded.image.shape, loaded.labels is None), {})[index] = loaded, fingerprint
-        except Exception as error:
-            outcomes[index] = _failure(error)
-    for group in groups.values():
-        outcomes |= _fit_group(jobs, group)
-    return [outcomes[index] for index in range(len(jobs))]
-
-
 def _fit_group(jobs: Sequence[FitJob], group: dict[int, tuple[Loaded, str]]) -> dict[int, Outcome]:
     """Fit images of the same shape together; if that fails, fit them one by one."""
     fits: dict[int, BatchFit] = {}
@@ -164,76 +139,17 @@ def _finish_job(job: FitJob, loaded: Loaded, fingerprint: str, fit: BatchFit | N
             if fit is None:
                 saved_fit = fit_and_save(job.output, loaded.image, loaded.labels, job.request)
             else:
-                scene, num_bytes = save_result(job.output, loaded.image, fit.result, job.request)
-                saved_fit = SavedFit(fit.result, scene, num_bytes, fit.seconds)
+                scene_and_size = save_result(job.output, loaded.image, fit.result, job.request)
+                saved_fit = SavedFit(fit.result, *scene_and_size, fit.seconds)
             report = report_fit(saved_fit, loaded.image, loaded.labels, job.output, job.request)
         row = {**replace_undefined(report), "fingerprint": fingerprint}
-        write_file(job.output.with_suffix(".json"), json.dumps({**row, "checksum": _checksum(job.output, row)}))
+        write_row(job, row)
         fit_warnings = () if fit is None else fit.warnings
         return Outcome(row, True, (*loaded.warnings, *fit_warnings, *(str(message.message) for message in messages)))
     except Exception as error:
-        return _failure(error)
+        return failure(error)
 
 
-def _failure(error: Exception) -> Outcome:
+def failure(error: Exception) -> Outcome:
+    """Return the outcome of a job that an error stopped."""
     return Outcome({"error": describe_error(error)}, True)
-
-
-def _is_done(job: FitJob) -> bool:
-    try:
-        return _valid_row(job, _fingerprint(job)) is not None
-    except OSError:
-        return False
-
-
-def _existing_row(job: FitJob, fingerprint: str) -> dict[str, Any] | None:
-    """Return the row of an unchanged scene, else None; without --overwrite, refuse to replace a file."""
-    record = job.output.with_suffix(".json")
-    if not job.output.is_file():
-        if record.is_file() and "fingerprint" not in _read_row(record) and not job.overwrite:
-            raise FileExistsError(f"{record} exists, and was not written by kcgs fit-many; --overwrite replaces it")
-        return None
-    row = _valid_row(job, fingerprint)
-    is_unfinished = _read_row(record) == {"fingerprint": fingerprint}
-    if row is None and not (is_unfinished or job.overwrite):
-        problem = "made with other settings or changed since"
-        raise FileExistsError(f"{job.output} exists, {problem}; --overwrite replaces it")
-    return row
-
-
-def _valid_row(job: FitJob, fingerprint: str) -> dict[str, Any] | None:
-    """Return the row beside a scene if its fingerprint and checksum are right, else None."""
-    row = _read_row(job.output.with_suffix(".json"))
-    checksum = row.pop("checksum", None)
-    is_same = row.get("fingerprint") == fingerprint and checksum == _checksum(job.output, row)
-    return row if is_same else None
-
-
-def _read_row(record: Path) -> dict[str, Any]:
-    """Read the row beside a scene; return an empty row if there is no readable one."""
-    try:
-        row = json.loads(record.read_bytes())
-    except (FileNotFoundError, ValueError):
-        return {}
-    return row if isinstance(row, dict) else {}
-
-
-def _checksum(output: Path, row: dict[str, Any]) -> str:
-    """Hash a scene and its row."""
-    return hashlib.sha256(output.read_bytes() + json.dumps(row).encode()).hexdigest()
-
-
-def _fingerprint(job: FitJob) -> str:
-    """Hash the image, the mask and all settings."""
-    mask = job.regions.encode() if job.regions in ("auto", "none") else Path(job.regions).read_bytes()
-    return hashlib.sha256(b"\0".join((describe_settings(job).encode(), job.image.read_bytes(), mask))).hexdigest()
-
-
-def describe_settings(job: FitJob) -> str:
-    """Return all settings that a scene depends on, besides the image and the mask, as text."""
-    request = job.request
-    settings: tuple[Any, ...] = (
-        request.load_config().model_dump_json(), request.num_gaussians, request.target_bytes, request.seed,
-    )  # fmt: skip
-    settings += ("grey",) if request.is_grey else ()
-    return repr(settings if job.threshold is None else (*settings, job.threshold))

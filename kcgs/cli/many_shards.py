@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-import math
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from .common import describe_error, replace_undefined
-from .many_jobs import FileBatch, FitJob, Loaded, Outcome, describe_settings, fit_batch, load_job
+from .many_fingerprints import FitJob, fingerprint_of_part
+from .many_jobs import FileBatch, Loaded, Outcome, failure, fit_batch, load_job
+from .reports import replace_undefined
 
 
 class ShardPart(NamedTuple):
@@ -36,7 +35,7 @@ class ShardPart(NamedTuple):
     @property
     def own_fingerprint(self) -> str:
         """Fingerprint of the part's file: with another batch size, the same shard has other parts."""
-        return _hash((self.fingerprint, [job.image.name for job in self.images]))
+        return fingerprint_of_part(self.fingerprint, self.images)
 
     def run(self) -> list[Outcome]:
         """Fit the images and write their scenes, unless these are in the shard or in the part's file."""
@@ -80,23 +79,6 @@ class Shards:
             _complete(parts, {name: row["error"] for name, row in rows.items() if "error" in row})
 
 
-def fingerprint_of(jobs: Sequence[FitJob]) -> str:
-    """Hash the settings, and the names and sizes of images and masks, but not their contents: there may be millions.
-
-    A mask of another size is an error of its image, which a shard keeps; so with --resize-regions a shard is another.
-    """
-    files = [(job.image.name, _bytes(job.image), _bytes(Path(job.regions)) or job.regions) for job in jobs]
-    return _hash((describe_settings(jobs[0]), files, *(["resized"] if jobs[0].resize_regions else [])))
-
-
-def _hash(value: object) -> str:
-    return hashlib.sha256(repr(value).encode()).hexdigest()
-
-
-def _bytes(path: Path) -> int | None:
-    return path.stat().st_size if path.is_file() else None
-
-
 def _fit_part(part: ShardPart) -> list[Outcome]:
     """Fit the images of a part, and write their scenes."""
     outcomes: dict[int, Outcome] = {}
@@ -109,7 +91,7 @@ def _fit_part(part: ShardPart) -> list[Outcome]:
                 raise ValueError(f"it has {size[1]} x {size[0]} pixels, others of its shard have another size")
             loaded[index] = one
         except Exception as error:
-            outcomes[index] = Outcome({"error": describe_error(error)}, True)
+            outcomes[index] = failure(error)
     if loaded:
         outcomes |= _fit_loaded(part, loaded, {index: outcome.row["error"] for index, outcome in outcomes.items()})
     return [outcomes[index] for index in range(len(part.images))]
@@ -126,7 +108,7 @@ def _fit_loaded(part: ShardPart, loaded: dict[int, Loaded], errors: dict[int, st
     try:
         fits = fit_batch([*loaded.values()], request)
     except Exception as error:  # images and maps were read, so the error is of the whole part
-        return {index: Outcome({"error": describe_error(error)}, True) for index in loaded}
+        return {index: failure(error) for index in loaded}
     with_maps = any(one.labels is not None for one in loaded.values())
     singles = [fit.result.scene for fit in fits]
     scenes = stack_scenes(singles, request.count_for(*singles[0].size), with_maps=with_maps)
@@ -179,7 +161,7 @@ def _complete(parts: Sequence[ShardPart], errors: Mapping[str, str]) -> None:
         parts: all parts of the shard.
         errors: messages of images that failed, by name.
     """
-    from kcgs.data import save_shard, stack_scenes
+    from kcgs.data import save_shard, shard_contents, stack_scenes
     from kcgs.files import load
 
     shard, fingerprint = parts[0].shard, parts[0].fingerprint
@@ -189,10 +171,10 @@ def _complete(parts: Sequence[ShardPart], errors: Mapping[str, str]) -> None:
     if scenes:
         names, psnr, rows = [], [], []
         for scene in scenes:
-            notes = scene.metadata
-            names += json.loads(notes["names"])
-            psnr += [math.inf if number is None else number for number in json.loads(notes["psnr"])]
-            rows += json.loads(notes["rows"])
+            part_names, part_psnr = shard_contents(scene.metadata, shard)
+            names += part_names
+            psnr += part_psnr
+            rows += json.loads(scene.metadata["rows"])
         notes = {"fingerprint": fingerprint, "rows": json.dumps(rows), "errors": json.dumps(errors)}
         singles = [one for scene in scenes for one in scene]
         joined = stack_scenes(singles, scenes[0].num_gaussians, with_maps=scenes[0].regions is not None)

@@ -1,19 +1,19 @@
-"""Options that several commands share, and the fit that they request."""
+"""Options that several commands share: the fit that they request, label maps, sizes of renders."""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
 from kcgs._objectives import PURPOSES, check_objective
+from kcgs._progress import Progress
 from kcgs.errors import InvalidArgument
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import torch
     from torch import Tensor
 
@@ -187,3 +187,31 @@ def target_size(scene: Scene, scale: float | None, size: str | None) -> tuple[in
         sides = max(1, round(scene.size[0] * factor)), max(1, round(scene.size[1] * factor))
     check_render_memory(scene, sides)
     return sides
+
+
+def read_regions(
+    regions: str, image: Tensor, threshold: float | None = None, *, resize: bool = False, progress: bool = False
+) -> Tensor | None:
+    """Return the label map of the option --regions, or None; `resize`: at the size of the image."""
+    if regions in ("auto", "none"):
+        exclude(f"--regions {regions}", threshold=threshold)
+    if regions == "none":
+        return None
+    if regions == "auto":
+        if min(image.shape[-2:]) < LEAST_SIDE:
+            return None
+        from kcgs.segment import segment
+
+        with Progress("finding regions", pulse=True, visible=progress):
+            return segment(image)
+    from kcgs.data import load_labels
+
+    labels, size = load_labels(Path(regions), threshold=threshold), (image.shape[-2], image.shape[-1])
+    if tuple(labels.shape) == size:
+        return labels
+    if not resize:
+        expected = f"one map of the image's size, {size[1]} x {size[0]}, which --resize-regions makes of it"
+        raise InvalidArgument("regions", expected, f"{labels.shape[-1]} x {labels.shape[-2]}")
+    from kcgs.maps import RegionMap
+
+    return RegionMap(labels).resize(size).labels

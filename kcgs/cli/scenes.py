@@ -14,17 +14,9 @@ from kcgs._progress import Progress
 from kcgs._suffixes import SCENES, VIDEOS, WRITTEN_IMAGES
 
 from .commands import app
-from .common import (
-    ImageFile,
-    Json,
-    Quiet,
-    SceneFile,
-    SceneOrMap,
-    check_output,
-    print_report,
-)
-from .fit import describe_file, describe_scene, read_regions
-from .options import Objective, ResizeRegions, Threshold, exclude, target_size
+from .common import ImageFile, Json, Quiet, SceneFile, SceneOrMap, check_output
+from .options import Objective, ResizeRegions, Threshold, exclude, read_regions, target_size
+from .reports import describe_file, describe_scene, print_report
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -112,22 +104,20 @@ def info(scene: SceneFile, as_json: Json = False) -> None:
     """
     from kcgs import load
     from kcgs._repr import shorten
+    from kcgs.maps import mean_softness
 
     if (labels := _read_map(scene)) is not None:
         print_report(_describe_map(scene, labels), as_json, str(scene))
         return
 
     loaded = load(scene)
-    softness = 0.0 if loaded.regions is None else loaded.regions.softness
-    parts = softness if isinstance(softness, tuple) else (softness,)
-    means = [part if isinstance(part, float) else sum(part.values()) / max(1, len(part)) for part in parts]
     report: dict[str, Any] = {
         "images": loaded.num_images or 1,
         **describe_scene(loaded),
         "channels": loaded.field.colors.shape[-1],
         "height": loaded.size[0],
         "width": loaded.size[1],
-        "softness": sum(means) / len(means),
+        "softness": 0.0 if loaded.regions is None else mean_softness(loaded.regions.softness),
         **describe_file(scene, scene.stat().st_size, loaded.size),
         **{f"metadata.{key}": value if as_json else shorten(value) for key, value in loaded.metadata.items()},
     }
@@ -135,9 +125,9 @@ def info(scene: SceneFile, as_json: Json = False) -> None:
         table = _describe_regions(loaded)
         if as_json:
             report["table"] = table
-        for row in () if as_json else table:
-            facts = "{area} pixels, one at {x}, {y}; mean {color}".format_map(row)
-            report[f"region {row['id']}"] = facts
+        else:
+            facts = "{area} pixels, one at {x}, {y}; mean {color}"
+            report |= {f"region {row['id']}": facts.format_map(row) for row in table}
     print_report(report, as_json, str(scene))
 
 
@@ -183,9 +173,8 @@ def encode(
 
     loaded = load(scene)
     target = None if image is None else _load_like(loaded, image)
-    goal: dict[str, Any] = {"quality": quality, "target_bytes": target_bytes}
     with Progress("writing the file", pulse=True, visible=not quiet):
-        num_bytes = loaded.save(output, image=target, **goal, objective=objective)
+        num_bytes = loaded.save(output, image=target, quality=quality, target_bytes=target_bytes, objective=objective)
     rounded = load(output)
     report = {
         "psnr_to_scene": float(psnr(rounded.render(), loaded.render())),

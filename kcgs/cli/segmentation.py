@@ -14,7 +14,8 @@ from kcgs._suffixes import WRITTEN_IMAGES
 from kcgs.errors import InvalidArgument
 
 from .commands import app
-from .common import ImageFile, Json, Quiet, check_output, print_report, replace_undefined
+from .common import ImageFile, Json, Quiet, check_output
+from .reports import print_report, replace_undefined
 
 
 def _list_methods(is_set: bool) -> None:

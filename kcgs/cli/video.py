@@ -15,8 +15,8 @@ from kcgs._suffixes import VIDEOS, WRITTEN_IMAGES
 
 from . import options
 from .commands import app
-from .common import InterruptHandler, Json, Quiet, check_new, check_output, exit_interrupted, print_report
-from .fit import describe_scene, read_regions
+from .common import InterruptHandler, Json, Quiet, check_new, check_output, exit_interrupted
+from .reports import describe_scene, print_report
 
 if TYPE_CHECKING:
     from kcgs.scene import Scene
@@ -76,7 +76,7 @@ def fit_video_command(
         options.exclude("a folder of label maps", threshold=threshold)
         maps = read_label_maps(regions)
     elif regions in ("auto", "none"):
-        maps = read_regions(regions, next(iter(source)), threshold, progress=not quiet)
+        maps = options.read_regions(regions, next(iter(source)), threshold, progress=not quiet)
     else:
         maps = load_labels(regions, rgb_ids=True, threshold=threshold)
     start = time.perf_counter()

@@ -9,7 +9,7 @@ import torch
 
 from kcgs._check import check_count
 from kcgs.errors import InvalidArgument
-from kcgs.maps import MAX_SOFTNESS, PairSoftness, RegionMap, compact, touching_pairs, wrap_labels
+from kcgs.maps import MAX_SOFTNESS, RegionMap, compact, softness_between, softness_of_map, touching_pairs, wrap_labels
 
 from .adaptive import AdaptiveSymbol
 from .exact import Integers
@@ -31,12 +31,8 @@ def encode_region_map(regions: RegionMap) -> bytes:
     check_count("number of regions", regions.num_regions, 1, MAX_REGIONS)
     ids, index = compact(regions.labels.cpu())
     labels = encode_stream(ids.numpy(), index.numpy(), is_file=False)
-    softness = regions.softness
-    assert not isinstance(softness, tuple)  # of one map
-    if isinstance(softness, PairSoftness):
-        units = [_round(softness.get(pair, 0.0)) for pair in sorted(touching_pairs(regions.labels))]
-    else:
-        units = [_round(softness)]
+    softness = softness_of_map(regions.softness)
+    units = [_round(softness_between(softness, a, b)) for a, b in sorted(touching_pairs(regions.labels))]
     palette = sorted(set(units))
     head = varint(len(labels)) + labels + b"".join(map(varint, [len(palette), *palette]))
     if len(palette) == 1:

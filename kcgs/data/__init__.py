@@ -10,7 +10,7 @@ from .colors import colorize_labels, label_colors, overlay_labels
 from .davis import Davis, DavisFrame
 from .images import load_image, save_image
 from .labels import load_labels, save_labels
-from .shards import SceneBatch, SceneDataset, save_shard, shard_path, stack_scenes
+from .shards import SceneBatch, SceneDataset, save_shard, shard_contents, shard_path, stack_scenes
 
 # the public names; other packages of kcgs use the other imports
 __all__ = [

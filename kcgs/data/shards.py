@@ -95,20 +95,22 @@ class SceneDataset(Dataset[Scene]):
             raise FileNotFoundError(f"folder must hold shards, such as 00000.safetensors; got {str(folder)!r}")
         self._open: dict[int, Shard] = {}
         self.names, psnrs, counts = [], [], []
-        for number in range(len(self._paths)):
-            names, psnr = shard_contents(self._shard(number).metadata, self._paths[number])
-            count = len(self._shard(number).tensors["means"])
+        layouts: dict[str, str] = {}
+        for path in self._paths:
+            shard = map_file(path)
+            names, psnr = shard_contents(shard.metadata, path)
+            count = len(shard.tensors["means"])
             if not len(names) == len(psnr) == count:
                 raise ValueError(
-                    f"{self._paths[number]} must have a name and a PSNR for each of its {count} scenes; "
+                    f"{path} must have a name and a PSNR for each of its {count} scenes; "
                     f"got {len(names)} names and {len(psnr)} PSNRs"
                 )
             counts.append(count)
             self.names += names
             psnrs += psnr
+            layouts[shard.layout] = path.name
         self.psnr = torch.tensor(psnrs, dtype=torch.float64)
         self._firsts = torch.tensor([0, *counts]).cumsum(0)
-        layouts = {self._shard(number).layout: path.name for number, path in enumerate(self._paths)}
         if len(layouts) > 1:
             expected = "shards of as many rows and channels, all with regions or none"
             raise InvalidArgument("folder", expected, layouts, verb="hold")
@@ -141,8 +143,8 @@ class SceneDataset(Dataset[Scene]):
             # each shard has the smallest integer type that holds its ids
             return torch.cat([part.long() if name == "region_ids" else part for part in parts])[place]
 
-        sizes = torch.tensor([self._shard(number).size for number in numbers.tolist()]).view(-1, 2)
-        ids = table("region_ids") if "region_ids" in self._shard(0).tensors else None
+        sizes = torch.tensor([self._shard(number).size for number in numbers.tolist()])
+        ids = table("region_ids") if "region_ids" in chosen[0][0].tensors else None
         return SceneBatch(positions, sizes, table("means"), table("cholesky"), table("colors"), ids)
 
     __getitems__ = batch  # a DataLoader calls it

@@ -9,7 +9,7 @@ import torch
 
 from kcgs._check import check_count
 from kcgs.errors import InvalidArgument
-from kcgs.maps import PairSoftness, RegionMap, nearest_labels, touching_pairs
+from kcgs.maps import RegionMap, largest_softness, nearest_labels, softness_between, softness_of_map, touching_pairs
 from kcgs.nn import GaussianField, join, scaled_gaussians
 from kcgs.scene import Scene, check_scene
 
@@ -90,9 +90,7 @@ def move_region(
 
 def _contour_reach(regions: RegionMap) -> int:
     """Return the distance from a contour, in pixels, within which the background of a region is visible."""
-    softness = _softness_of_one(regions)
-    largest = softness if isinstance(softness, float) else max(softness.values(), default=0.0)
-    return math.ceil(1.0 + _CONTOUR_SIGMAS * largest)
+    return math.ceil(1.0 + _CONTOUR_SIGMAS * largest_softness(softness_of_map(regions.softness)))
 
 
 def delete_region(scene: Scene, region_ids: int | Iterable[int], *, fill: bool = True, margin: int = MARGIN) -> Scene:
@@ -165,39 +163,27 @@ def replace_background(scene: Scene, region_ids: int | Iterable[int], background
     first_id = int(regions.ids.max()) + 1
     background_labels = torch.full_like(regions.labels, first_id)
     ids = background_labels.new_full((other.num_gaussians,), first_id)
-    softness: float | PairSoftness | None = None
+    background_map: RegionMap | None = None
     if background.regions is not None and other.region_ids is not None:
         background_map = background.regions.resize(scene.size)
         background_labels = background_map.labels.to(ids.device) + first_id
         ids = other.region_ids.to(ids.device) + first_id
-        softness = _softness_of_one(background_map)
     labels = torch.where(pixels, background_labels, regions.labels)
-    new_map = _with_softness(regions.relabel(labels, "mean"), softness, first_id)
+    new_map = _with_softness(regions.relabel(labels, "mean"), background_map, first_id)
     means, cholesky, colors = (t.to(field.means) for t in (*scaled_gaussians(other, scene.size), other.merged_colors()))
     new_field = join(field.subset(~members), GaussianField(means, cholesky, colors, ids, size=scene.size))
     return Scene(new_field.subset(members_of(new_field, labels)), new_map, scene.metadata)
 
 
-def _softness_of_one(regions: RegionMap) -> float | PairSoftness:
-    """Return the softness of a map without a batch."""
-    softness = regions.softness
-    assert not isinstance(softness, tuple)
-    return softness
-
-
-def _with_softness(regions: RegionMap, softness: float | PairSoftness | None, first_id: int) -> RegionMap:
-    """Give contours between regions with ids from `first_id` on the softness of a map where these ids began at 0."""
-    before = _softness_of_one(regions)
-    if softness is None or softness == before:
+def _with_softness(regions: RegionMap, background: RegionMap | None, first_id: int) -> RegionMap:
+    """Give contours between ids from `first_id` on the softness of the background, whose ids begin at 0."""
+    if background is None:
         return regions
-
-    def width(softness: float | PairSoftness, a: int, b: int) -> float:
-        return softness if isinstance(softness, float) else softness.get((a, b), 0.0)
-
-    return RegionMap(
-        regions.labels,
-        {
-            (a, b): width(before, a, b) if min(a, b) < first_id else width(softness, a - first_id, b - first_id)
-            for a, b in touching_pairs(regions.labels)
-        },
-    )
+    old, new = softness_of_map(regions.softness), softness_of_map(background.softness)
+    if new == old:
+        return regions
+    pairs = {
+        (a, b): softness_between(old, a, b) if a < first_id else softness_between(new, a - first_id, b - first_id)
+        for a, b in touching_pairs(regions.labels)
+    }
+    return RegionMap(regions.labels, pairs)

@@ -13,7 +13,7 @@ from kcgs._check import check_count, check_size
 from kcgs._memory import check_batch_memory
 from kcgs._objectives import Purpose
 from kcgs.errors import InvalidArgument
-from kcgs.maps import RegionMap, edge_band
+from kcgs.maps import RegionMap, edge_band, softness_of_map
 from kcgs.optim import OBJECTIVES, ImageObjective, LossObjective, Objective
 
 from .checks import check_images_and_regions, check_num_gaussians, is_batch, regions_of
@@ -110,8 +110,8 @@ class Problem:
 
     def chooses_softness(self, image: int) -> bool:
         """Whether the fit chooses the softness of an image's contours: the setting is auto, and the map has none."""
-        softness = None if self.regions is None else self.regions.softness
-        return self.config.softness == "auto" and (softness[image] if isinstance(softness, tuple) else softness) == 0.0
+        softness = None if self.regions is None else softness_of_map(self.regions.softness, image)
+        return self.config.softness == "auto" and softness == 0.0
 
     @cached_property
     def objective(self) -> Objective:

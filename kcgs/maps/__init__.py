@@ -22,7 +22,16 @@ from .membership import Membership
 from .region_graph import Labels, RegionGraph, merge_nearest, pairs_to_merge
 from .regions import RegionMap, wrap_labels
 from .resampled import LEAST_BLUR, SmoothMembership, cut_windows, find_windows, sharpness
-from .softness import MAX_SOFTNESS, PairSoftness, softness_from_plain, softness_to_plain
+from .softness import (
+    MAX_SOFTNESS,
+    PairSoftness,
+    largest_softness,
+    mean_softness,
+    softness_between,
+    softness_from_plain,
+    softness_of_map,
+    softness_to_plain,
+)
 from .table import PER_MAP, SHARED, MapTable, with_positions
 from .tile import TILE
 from .widths import RADIUS_SIGMAS, truncated_gaussian

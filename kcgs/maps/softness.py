@@ -95,6 +95,28 @@ def _check_one(softness: object, ids: Tensor) -> OneSoftness:
     return PairSoftness(pixels) if len(distinct) > 1 else distinct.pop() if distinct else 0.0
 
 
+def softness_of_map(softness: Softness, number: int = 0) -> OneSoftness:
+    """Return the softness of one map of a batch, or of a map without a batch."""
+    return softness[number] if isinstance(softness, tuple) else softness
+
+
+def softness_between(softness: OneSoftness, a: int, b: int) -> float:
+    """Return the softness of the contour between two regions."""
+    return softness if isinstance(softness, float) else softness.get((a, b), 0.0)
+
+
+def largest_softness(softness: OneSoftness) -> float:
+    """Return the softness of the softest contour."""
+    return softness if isinstance(softness, float) else max(softness.values())
+
+
+def mean_softness(softness: Softness) -> float:
+    """Return the mean softness of the pairs that have one; of a batch, the mean over its maps."""
+    if isinstance(softness, tuple):
+        return sum(map(mean_softness, softness)) / len(softness)
+    return softness if isinstance(softness, float) else sum(softness.values()) / len(softness)
+
+
 def softness_by_position(softness: OneSoftness, ids: Tensor) -> float | dict[tuple[int, int], float]:
     """Return softness with every id replaced by its position among the sorted ids."""
     if not isinstance(softness, PairSoftness):
@@ -131,8 +153,8 @@ def extended_softness(softness: OneSoftness, labels: Tensor, old_labels: Tensor)
     """Return the softness of other labels: pairs that touch only there get the mean, unless they have a softness."""
     if isinstance(softness, float):
         return softness
-    mean = sum(softness.values()) / len(softness)
-    return dict.fromkeys(touching_pairs(labels) - touching_pairs(old_labels), mean) | {**softness}
+    new_pairs = touching_pairs(labels) - touching_pairs(old_labels)
+    return dict.fromkeys(new_pairs, mean_softness(softness)) | {**softness}
 
 
 def softness_of_labels(softness: OneSoftness | Mapping[tuple[int, int], float], labels: Tensor) -> Any:
