@@ -59,7 +59,7 @@ def write_count(regions: int) -> bytes:
 
 
 class TestDamagedScenes:
-    @pytest.mark.parametrize(("count", "seed"), [(100, 0), pytest.param(10_000, 1, marks=pytest.mark.slow)])
+    @pytest.mark.parametrize(("count", "seed"), [(40, 0), pytest.param(10_000, 1, marks=pytest.mark.slow)])
     def test_any_damage(self, count: int, seed: int) -> None:
         data, generator, num_cut, num_forged = GOLDEN.read_bytes(), random.Random(seed), 0, 0
         for _ in range(count // 2):
@@ -89,7 +89,7 @@ class TestDamagedScenes:
                 counts.append(decoded.scene.num_gaussians)
         assert counts == sorted(counts) and len({*counts}) == len(ends)
 
-    @pytest.mark.parametrize("data", [b"", b"k", b"kcgs", b"kcgs\2", b"PNG0" * 9, bytes(100)])
+    @pytest.mark.parametrize("data", [b"", b"kcgs", b"PNG0" * 9])
     def test_other_files(self, data: bytes) -> None:
         assert not is_scene(data)
 
@@ -107,9 +107,8 @@ class TestDamagedScenes:
             decode(pack(header._replace(layers=(header.layers[0],) * 129), region_map, [layers[0]] * 129))
         with pytest.raises(CodecError, match="an image with regions must have at most 67108864 pixels"):
             decode(pack(header._replace(size=(1 << 20, 1 << 20)), region_map, layers))
-        for version in (0, 2, 3):
-            with pytest.raises(CodecError, match=f"its version must be 1; got {version}"):
-                decode(b"kcgs" + bytes([version]) + data[5:])
+        with pytest.raises(CodecError, match="its version must be 1; got 2"):
+            decode(b"kcgs\2" + data[5:])
 
     @pytest.mark.parametrize(
         ("regions", "match"),
@@ -148,7 +147,7 @@ def forge_map(form: int, size: bytes, stream: bytes) -> bytes:
 class TestDamagedMaps:
     def test_any_damage(self, files: list[bytes]) -> None:
         generator = random.Random(0)
-        for trial in range(1_000):
+        for trial in range(300):
             mutated = damaged(files[trial % 3], generator)
             if mutated != files[trial % 3]:
                 with pytest.raises(CodecError):
@@ -277,7 +276,7 @@ def forge(header: Header, generator: np.random.Generator) -> bytes:
 
 def test_any_number_that_a_file_can_hold() -> None:
     generator, num_valid = np.random.default_rng(0), 0
-    for _ in range(70):
+    for _ in range(30):
         energies = np.unique(generator.choice([-24, -23, 0, 5, 39, 40], 3))[::-1]
         size = [(1, 1), (7, 9), (300, 400), (1, 1 << 20), (1 << 20, 1 << 20)][generator.integers(5)]
         qp, channels = generator.choice([-512, 0, 300, 1023]), generator.choice([1, 3, 4, 20])
@@ -285,7 +284,7 @@ def test_any_number_that_a_file_can_hold() -> None:
         if data:
             assert_valid(decode(data))
             num_valid += 1
-    assert num_valid > 10
+    assert num_valid > 4
 
 
 def write_counts(first: int, count: int, writer: Writer | None = None) -> Writer:
@@ -297,16 +296,15 @@ def write_counts(first: int, count: int, writer: Writer | None = None) -> Writer
     return writer
 
 
-def refuse(writer: Writer, match: str, size: tuple[int, int] = (9, 9), qp: int = 0, energy: int = 0) -> None:
+def refuse(writer: Writer, match: str, qp: int = 0, energy: int = 0) -> None:
     """A file of this one layer is a CodecError."""
     layer = writer.finish()
     with pytest.raises(CodecError, match=match):
-        decode(pack(Header(size, 1, qp, 1, ((energy, len(layer)),)), b"", [layer]))
+        decode(pack(Header((9, 9), 1, qp, 1, ((energy, len(layer)),)), b"", [layer]))
 
 
-@pytest.mark.parametrize("position", [37, 63])
-def test_an_unknown_class_of_size(position: int) -> None:
-    refuse(write_counts(position, 1), "a class of size must be at most 28")
+def test_an_unknown_class_of_size() -> None:
+    refuse(write_counts(37, 1), "a class of size must be at most 28")
 
 
 def test_an_empty_group() -> None:
@@ -321,39 +319,28 @@ def test_a_ratio_beyond_all() -> None:
     refuse(writer, "a ratio must be at most 0 steps", qp=-512, energy=-24)
 
 
-def write_nothing(size: tuple[int, int], count: int) -> bytes:
-    """Name Gaussians of a class of size, but cells that hold none."""
-    writer, grid = write_counts(5, count), Grid.for_count(size, count)
-    OccupancyCoder(size)._code_margin(writer, grid, np.zeros((1, 2), np.int64))
-    cells, chance = grid.rows * grid.columns, 65536 * count / (count + grid.rows * grid.columns)
+def test_many_cells_take_little_memory() -> None:
+    """A row of cells is in memory, with as many as may lie near it. The file names Gaussians, but cells hold none."""
+    side, count = 1 << 10, 60_000
+    writer, grid = write_counts(5, count), Grid.for_count((side, side), count)
+    OccupancyCoder((side, side))._code_margin(writer, grid, np.zeros((1, 2), np.int64))
+    cells = grid.rows * grid.columns
     for _ in range(0, cells, 65536):
-        writer.bits(np.full(65536, np.floor(chance) / 65536), np.zeros(65536, np.int32))
+        writer.bits(np.full(65536, (65536 * count // (count + cells)) / 65536), np.zeros(65536, np.int32))
     layer = writer.finish().ljust(count // 8, b"\0")
-    return pack(Header(size, 1, 0, 1, ((0, len(layer)),)), b"", [layer])
-
-
-# a row of cells is in memory, with as many as may lie near it
-@pytest.mark.parametrize(
-    ("size", "max_bytes"), [((1 << 20, 1), 10e6), ((1 << 10, 1 << 10), 10e6), ((1, 1 << 20), 70e6)]
-)
-def test_many_cells_take_little_memory(size: tuple[int, int], max_bytes: float) -> None:
-    data = write_nothing(size, 60_000)
+    data = pack(Header((side, side), 1, 0, 1, ((0, len(layer)),)), b"", [layer])
     tracemalloc.start()
     with pytest.raises(CodecError, match="cells must hold 60000 Gaussians; got 0"):
         decode(data)
-    assert tracemalloc.get_traced_memory()[1] < max_bytes
+    assert tracemalloc.get_traced_memory()[1] < 10e6
     tracemalloc.stop()
 
 
-class Scripted(Writer):
-    """Writes these symbols after groups, in place of the true ones."""
-
-    def __init__(self, *symbols: int) -> None:
-        super().__init__()
-        self._symbols = list(symbols)
+class Endless(Writer):
+    """Writes after each group that another follows."""
 
     def number(self, value: int, size: int) -> int:
-        return super().number(self._symbols.pop(0), size)
+        return super().number(1, size)
 
 
 def make_group(quantizer: Quantizer, energy: int, count: int = 5) -> Group:
@@ -364,13 +351,11 @@ def make_group(quantizer: Quantizer, energy: int, count: int = 5) -> Group:
     return codes.select(np.lexsort(codes.cell.T)), writer.ids
 
 
-@pytest.mark.parametrize(("energy", "symbols"), [(-24, [1]), (-24, [2]), (-23, [1, 1]), (-22, [2, 2, 2])])
-def test_an_energy_below_all(energy: int, symbols: list[int]) -> None:
-    writer, quantizer, message = Scripted(*symbols), Quantizer(0, (9, 9)), "must be at least -24; got -25"
-    groups = [make_group(quantizer, energy - i) for i in range(1 + symbols[:-1].count(1))]
+def test_an_energy_below_all() -> None:
+    writer, quantizer, message = Endless(), Quantizer(0, (9, 9)), "must be at least -24; got -25"
     with pytest.raises(CodecError, match=message):
-        LayerCoder(quantizer, 1, None).write(writer, groups)
-    refuse(writer, message, energy=energy)
+        LayerCoder(quantizer, 1, None).write(writer, [make_group(quantizer, -24)])
+    refuse(writer, message, energy=-24)
 
 
 def test_too_many_gaussians() -> None:
@@ -400,8 +385,6 @@ class ConstantBits(Writer):
     [
         (0, 0, 0, "cells must hold 2 Gaussians; got 0"),
         (0, 0, 1, "cells must hold at most the 2 Gaussians that remain; got more"),
-        (1, 2, 0, "cells must hold 2 Gaussians; got 0"),
-        (1, 2, 1, "cells must hold at most the 2 Gaussians that remain; got more"),
         (1, 3, 0, "at most 2 Gaussians may lie outside; got 3"),
         (255, 0, 0, "a margin must be at most 177 cells; got 255"),
     ],
@@ -435,17 +418,6 @@ def test_too_many_cells_outside(monkeypatch: pytest.MonkeyPatch) -> None:
         decoder.code(reader, 4, far)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (5, 7), (1, 300), (64, 48)])
-@pytest.mark.parametrize("margin", [0, 1, 6])
-def test_split_and_join_cells(size: tuple[int, int], margin: int) -> None:
-    grid = Grid.for_count(size, 3)._replace(margin=margin)
-    height, width = grid.rows + 2 * margin, grid.columns + 2 * margin
-    row, column = np.divmod(np.arange(height * width), width)
-    cell = np.stack([column, row], -1) - margin
-    inside, outside = grid.split(cell)
-    assert inside.tolist() == list(range(grid.rows * grid.columns))
-    assert outside.tolist() == list(range(grid.num_outside))
-    assert np.array_equal(grid.join(inside, outside), cell)
 
 
 def write_cells(size: tuple[int, int], count: int) -> tuple[bytes, list[tuple[int, Integers]]]:
@@ -461,7 +433,7 @@ def write_cells(size: tuple[int, int], count: int) -> tuple[bytes, list[tuple[in
     return writer.finish(), classes
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 3000), (3000, 1), (3, 1000), (1024, 1024), (1, 1 << 17)])
+@pytest.mark.parametrize("size", [(1, 1), (1024, 1024), (1, 1 << 17)])
 def test_cells_of_any_shape(size: tuple[int, int]) -> None:
     data, classes = write_cells(size, min(40_000, size[0] * size[1]))
     reader, decoder = Reader(data), OccupancyCoder(size)
