@@ -10,27 +10,22 @@ from kcgs.data import ChartSample, chart_2x3, chart_pie
 
 
 @pytest.mark.parametrize(("chart", "height"), [(chart_2x3, 200), (chart_pie, 300)])
-class TestEveryChart:
-    @pytest.mark.parametrize("scale", [1, 2, 3])
-    def test_sizes_and_types(self, chart: Callable[..., ChartSample], height: int, scale: int) -> None:
-        image, labels = chart(scale=scale)
-        assert image.shape == (3, height * scale, 300 * scale) and labels.shape == image.shape[1:]
-        assert (image.dtype, labels.dtype) == (torch.float32, torch.int64) and image.is_contiguous()
-        assert 0 <= image.min() <= image.max() <= 1
-        assert torch.equal(chart(scale=scale).image, image)
+@pytest.mark.parametrize("scale", [1, 3])
+def test_sizes_and_types(chart: Callable[..., ChartSample], height: int, scale: int) -> None:
+    image, labels = chart(scale=scale)
+    assert image.shape == (3, height * scale, 300 * scale) and labels.shape == image.shape[1:]
+    assert (image.dtype, labels.dtype) == (torch.float32, torch.int64) and image.is_contiguous()
+    assert 0 <= image.min() <= image.max() <= 1
+    assert torch.equal(chart(scale=scale).image, image)
 
-    @pytest.mark.parametrize(
-        ("scale", "error", "message"),
-        [
-            *((scale, ValueError, "scale must be at least 1; got") for scale in (0, -1)),
-            *((scale, TypeError, "scale must be an integer; got") for scale in (1.5, "2", True, None)),
-        ],
-    )
-    def test_bad_scale(
-        self, chart: Callable[..., ChartSample], height: int, scale: Any, error: type[Exception], message: str
-    ) -> None:
-        with pytest.raises(error, match=message):
-            chart(scale)
+
+@pytest.mark.parametrize("chart", [chart_2x3, chart_pie])
+@pytest.mark.parametrize(
+    ("scale", "message"), [(0, "scale must be at least 1; got 0"), (1.5, "scale must be an integer; got 1.5")]
+)
+def test_bad_scale(chart: Callable[..., ChartSample], scale: Any, message: str) -> None:
+    with pytest.raises((TypeError, ValueError), match=message):
+        chart(scale)
 
 
 class TestChart2x3:
