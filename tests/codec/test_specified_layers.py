@@ -13,15 +13,15 @@ import pytest
 import torch
 
 from kcgs.codec import decode, encode
-from kcgs.codec.exact import cos_sin, exp2
+from kcgs.codec.exact import Integers, cos_sin, exp2
 from kcgs.codec.file import Header, unpack
 from kcgs.codec.gaussians import occupancy
 from kcgs.codec.gaussians.quantize import opponent
 from kcgs.codec.gaussians.shapes import ANGLE, SHAPES
+from kcgs.codec.rangecoder import Writer
 
 from .conftest import make_scene
 from .symbols import AdaptiveSymbol, Bits
-from .test_hostile import write_cells
 
 LN2 = 0.6931471805599453
 BAND = 65536  # cells
@@ -273,6 +273,19 @@ class TestLayers:
     @pytest.mark.parametrize(("regions", "channels", "quality"), [(1, 1, 20.0), (3, 3, 50.0), (2, 4, 80.0)])
     def test_encoded(self, regions: int, channels: int, quality: float) -> None:
         check_scene(encode(make_scene(120, regions=regions, channels=channels, seed=3), quality=quality))
+
+
+def write_cells(size: tuple[int, int], count: int) -> tuple[bytes, list[tuple[int, Integers]]]:
+    """Write the cells of three classes of size, some outside; return the classes and their cells, too."""
+    generator, writer, coder, classes = np.random.default_rng(0), Writer(), occupancy.OccupancyCoder(size), []
+    for class_of_size, share in ((2, 1.0), (1, 0.4), (2, 0.01)):
+        some = max(int(share * count), 1)
+        grid = occupancy.Grid.for_count(size, some)
+        column, row = ((generator.random(some) ** 2 * (n + 1)).astype(int) for n in (grid.columns, grid.rows))
+        cell = np.stack([column, row], -1)
+        classes.append((class_of_size, cell[np.lexsort(cell.T)]))
+        coder.code(writer, class_of_size, classes[-1][1])
+    return writer.finish(), classes
 
 
 @pytest.mark.parametrize("size", [(66, 125), (1, 300), (2, 3)])
