@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from kcgs.codec import decode, encode
-from kcgs.codec.exact import Integers, cos_sin, exp2
+from kcgs.codec.exact import cos_sin, exp2
 from kcgs.codec.file import Header, unpack
 from kcgs.codec.gaussians import occupancy
 from kcgs.codec.gaussians.quantize import opponent
@@ -275,25 +275,19 @@ class TestLayers:
         check_scene(encode(make_scene(120, regions=regions, channels=channels, seed=3), quality=quality))
 
 
-def write_cells(size: tuple[int, int], count: int) -> tuple[bytes, list[tuple[int, Integers]]]:
-    """Write the cells of three classes of size, some outside; return the classes and their cells, too."""
-    generator, writer, coder, classes = np.random.default_rng(0), Writer(), occupancy.OccupancyCoder(size), []
-    for class_of_size, share in ((2, 1.0), (1, 0.4), (2, 0.01)):
-        some = max(int(share * count), 1)
-        grid = occupancy.Grid.for_count(size, some)
-        column, row = ((generator.random(some) ** 2 * (n + 1)).astype(int) for n in (grid.columns, grid.rows))
-        cell = np.stack([column, row], -1)
-        classes.append((class_of_size, cell[np.lexsort(cell.T)]))
-        coder.code(writer, class_of_size, classes[-1][1])
-    return writer.finish(), classes
-
-
 @pytest.mark.parametrize("size", [(66, 125), (1, 300), (2, 3)])
 def test_cells(size: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
-    """With bands of fewer cells, so that a small grid has more than eight."""
+    """Cells of three classes of size, some outside; bands of fewer cells, so that a small grid has more than eight."""
     monkeypatch.setattr(occupancy, "_GROUP", 1024)
     monkeypatch.setattr(f"{__name__}.BAND", 1024)
-    data, classes = write_cells(size, min(600, size[0] * size[1]))
-    bits, cells = Bits(data), Occupancy(size)
-    for s, cell in classes:
-        assert cells.read(bits, s, len(cell)) == [(row, column) for column, row in cell.tolist()]
+    generator, writer, coder, classes = np.random.default_rng(0), Writer(), occupancy.OccupancyCoder(size), []
+    for s, share in ((2, 1.0), (1, 0.4), (2, 0.01)):
+        count = max(int(share * min(600, size[0] * size[1])), 1)
+        grid = occupancy.Grid.for_count(size, count)
+        column, row = ((generator.random(count) ** 2 * (n + 1)).astype(int) for n in (grid.columns, grid.rows))
+        order = np.lexsort((column, row))
+        coder.code(writer, s, np.stack([column, row], -1)[order])
+        classes.append((s, list(zip(row[order], column[order], strict=True))))
+    bits, cells = Bits(writer.finish()), Occupancy(size)
+    for s, expected in classes:
+        assert cells.read(bits, s, len(expected)) == expected

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import ast
 import errno
-import inspect
 import os
 import sys
 from collections.abc import Callable
 from importlib import import_module
-from importlib.util import resolve_name
 from pathlib import Path
-from types import CodeType, FunctionType
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import numpy as np
 import pytest
@@ -133,55 +129,6 @@ def test_constant_of_another_module(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert len(list((tmp_path / "cache").rglob("*.nbc"))) == num_files
 
 
-def global_names(code: CodeType) -> set[str]:
-    """Return the names of globals, and of attributes, in the code of a function and of the functions within it."""
-    return set(code.co_names).union(*(global_names(part) for part in code.co_consts if isinstance(part, CodeType)))
-
-
-def find_origins(module: str) -> dict[str, str]:
-    """Return the modules that a module imports names from; where a room of kcgs does so, too, those."""
-    origins: dict[str, str] = {}
-    for node in ast.walk(ast.parse(inspect.getsource(sys.modules[module]))):
-        if isinstance(node, ast.ImportFrom):
-            source = resolve_name("." * node.level + (node.module or ""), sys.modules[module].__package__)
-            is_door = source.startswith("kcgs.") and hasattr(sys.modules[source], "__path__")
-            inner = find_origins(source) if is_door else {}
-            origins |= {alias.asname or alias.name: inner.get(alias.name, source) for alias in node.names}
-    return origins
-
-
-def find_modules(loop: Any) -> set[str]:
-    """Return the modules of kcgs that a loop, and the functions and classes that it uses, take names from."""
-    modules: set[str] = set()
-    pending, visited = [loop], set()
-    while pending:
-        value = pending.pop()
-        value = getattr(value, "py_func", getattr(value, "_defn", value))  # of compiled functions, and of intrinsics
-        if id(value) in visited or not str(getattr(value, "__module__", "")).startswith("kcgs."):
-            continue
-        visited.add(id(value))
-        if isinstance(value, type):
-            pending += vars(value).values()
-        if isinstance(value, FunctionType):
-            origins = find_origins(value.__module__)
-            names = global_names(value.__code__) & value.__globals__.keys()
-            pending += [value.__globals__[name] for name in names]
-            pending += [cell.cell_contents for cell in value.__closure__ or ()]
-            modules |= {value.__module__, *(origins.get(name, value.__module__) for name in names)}
-    return {module for module in modules if module.startswith("kcgs.")}
-
-
-@pytest.mark.parametrize(
-    "file",
-    sorted(file.relative_to(ROOT) for file in ROOT.rglob("*.py") if "\n@program.entry\n" in file.read_text("utf-8")),
-    ids=str,
-)
-def test_sources_hold_all_that_loops_name(file: Path) -> None:
-    module = import_module(".".join(("kcgs", *file.with_suffix("").parts)))
-    loops = [value for value in vars(module).values() if isinstance(getattr(value, "_cache", None), program._Cache)]
-    modules = set().union(*map(find_modules, loops))
-    assert module.__name__ in modules
-    assert {Path(str(sys.modules[name].__file__)) for name in modules} <= program._find_sources(ROOT / file)
 
 
 @pytest.mark.parametrize(
