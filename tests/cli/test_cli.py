@@ -76,8 +76,6 @@ class TestFit:
         field = load("scene.safetensors").field
         assert ((field.means >= 0) & (field.means <= torch.tensor([60.0, 40.0]))).all()
         assert field.colors.min() >= -1 and field.colors.max() <= 2
-        code, _, err = kcgs("fit", "photo.png", "--target-bytes", 300, "--bounded")
-        assert code == 2 and "must be False for a file of a size; got True" in err
 
     def test_keep_contours(self, kcgs: Kcgs) -> None:
         assert "\nregions: 2 of 2 regions kept\n" in kcgs(*FIT, "--regions", "mask.png", "--keep-contours").out
