@@ -5,10 +5,9 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import tempfile
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import pytest
 import torch
@@ -66,32 +65,26 @@ def test_closed_standard_output() -> None:
         ("export", "scene.safetensors", "-o"),
     ],
 )
-def test_outputs_are_tried_before_the_work(
-    kcgs: Kcgs, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...]
-) -> None:
+def test_outputs_are_tried_before_the_work(kcgs: Kcgs, arguments: tuple[str, ...]) -> None:
     suffix = {"export": ".onnx", "encode": ".kcgs", "fit": ".safetensors"}.get(arguments[0], ".png")
     Path(f"folder{suffix}").mkdir()
-    Path("sealed").mkdir()
-    make_file = tempfile.TemporaryFile
-
-    # the tests may run as root, to whom a mode forbids nothing
-    def refuse(*, dir: Path) -> Any:
-        if dir.name == "sealed":
-            raise PermissionError(13, "Permission denied")
-        return make_file(dir=dir)
-
-    monkeypatch.setattr("kcgs._atomic.tempfile.TemporaryFile", refuse)
     before = sorted(Path().rglob("*"))
     option = "--output" if arguments[-1] == "-o" else arguments[-1]
-    for place in ("folder", "nowhere/x", "sealed/x"):
+    for place, status in (("folder", 1), ("nowhere/x", 2)):
         # the input is missing, too, which would be found later
         code, out, err = kcgs(arguments[0], f"no-{arguments[1]}", *arguments[2:], f"{place}{suffix}")
-        assert (
-            (code, out) == (2 if place == "nowhere/x" else 1, "")
-            and err.startswith(f"kcgs: {option} ")
-            and err.count("\n") == 1
-        ), err
+        assert (code, out, err.count("\n")) == (status, "", 1) and err.startswith(f"kcgs: {option} "), err
         assert sorted(Path().rglob("*")) == before
+
+
+def test_a_sealed_folder(kcgs: Kcgs, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(**_: object) -> NoReturn:  # the tests may run as root, to whom a mode forbids nothing
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("kcgs._atomic.tempfile.TemporaryFile", refuse)
+    run = kcgs("render", "scene.safetensors", "-o", "large.png")
+    assert run.code == 1 and run.err.startswith("kcgs: --output cannot be written into '")
+    assert run.err.endswith("': Permission denied\n")
 
 
 

@@ -20,7 +20,6 @@ from kcgs import GaussianField, Scene, load
 from kcgs.compiled import num_threads, threads_for_kernels
 from kcgs.compiled.program import Program
 from kcgs.compiled.tasks import first_task, next_task, phases, run_tasks
-from kcgs.editing import delete_region
 from kcgs.rate import compress
 from kcgs.segment import segment
 
@@ -57,9 +56,7 @@ class TestThreads:
     @pytest.mark.parametrize(
         ("name", "work"),
         [
-            ("kcgs.editing.fill.inpaint_from_matches", lambda: delete_region(scene(), 1)),
             ("kcgs.segment.cleanup.merge_small", lambda: segment(torch.rand(3, *SIZE), "felzenszwalb")),
-            ("kcgs.segment.methods.auto.clean", lambda: segment(torch.rand(3, *SIZE))),
             ("kcgs.rate.compress.psnr", lambda: compress(scene(), torch.rand(3, *SIZE), target_psnr=5.0)),
         ],
     )

@@ -92,15 +92,11 @@ EXACT, EIGHT_BITS, JPEG = 1e-6, 0.02, 0.05
 FILES: dict[str, tuple[bytes, str, Any, float]] = {
     "RGB": (pillow_bytes(RGB), "RGB", RGB / 255, EXACT),
     "RGB as L": (pillow_bytes(RGB), "L", RGB / 255 @ LUMA, EXACT),
-    "RGB as RGBA": (pillow_bytes(RGB), "RGBA", np.insert(RGB / 255, 3, 1, -1), EXACT),
     "RGBA": (pillow_bytes(RGBA), "RGBA", RGBA / 255, EXACT),
     "RGBA as RGB": (pillow_bytes(RGBA), "RGB", on_white(RGBA), EXACT),
-    "RGBA as L": (pillow_bytes(RGBA), "L", on_white(RGBA) @ LUMA, EXACT),
-    "grey": (pillow_bytes(GREY), "L", GREY / 255, EXACT),
     "grey as RGB": (pillow_bytes(GREY), "RGB", GREY.repeat(3, -1) / 255, EXACT),
     "one bit": (pillow_bytes(GREY > 127), "L", GREY > 127, EXACT),
     "grey and alpha": (pillow_bytes(GREY_ALPHA), "RGBA", GREY_ALPHA[..., [0, 0, 0, 1]] / 255, EXACT),
-    "grey and alpha as RGB": (pillow_bytes(GREY_ALPHA), "RGB", on_white(GREY_ALPHA).repeat(3, -1), EXACT),
     "palette": (pillow_bytes(PALETTE), "RGB", np.asarray(PALETTE.convert("RGB")) / 255, EXACT),
     "palette with transparency": (
         pillow_bytes(CLEAR_PALETTE, transparency=bytes([0, 51, 255])), "RGB", [[[1, 1, 1], [0.8, 1, 0.8], [0, 0, 1]]],
@@ -108,13 +104,11 @@ FILES: dict[str, tuple[bytes, str, Any, float]] = {
     ),
     "colour key": (png_bytes(RGB, [KEY]), "RGBA", np.concatenate([RGB / 255, KEY_ALPHA], -1), EXACT),
     "portable graymap": (GRAYMAP, "L", DEEP[1] / 65535, EXACT),
-    "CMYK TIFF": (pillow_bytes(Image.fromarray(CMYK_RED, mode="CMYK"), "TIFF"), "RGB", RED, EXACT),
     "CMYK JPEG": (pillow_bytes(Image.fromarray(CMYK_RED, mode="CMYK"), "JPEG", quality=100), "RGB", RED, EIGHT_BITS),
     "JPEG": (pillow_bytes(RAMP, "JPEG", quality=95), "RGB", RAMP / 255, JPEG),
     "WebP": (pillow_bytes(RAMP, "WEBP", quality=95), "RGB", RAMP / 255, JPEG),
     "TIFF with white as zero": (tiff_bytes(DEEP[1], photometric="miniswhite"), "L", 1 - DEEP[1] / 65535, EXACT),
     "float TIFF": (tiff_bytes(FLOATS), "RGB", FLOATS, 0),
-    "grey float TIFF": (tiff_bytes(FLOATS[..., :1]), "L", FLOATS[..., :1], 0),
 }  # fmt: skip
 for count, name in ((1, "L"), (3, "RGB"), (4, "RGBA")):  # 16 bits, to less than one of 65,535 levels
     FILES[f"16-bit PNG {name}"] = png_bytes(DEEP[count]), name, DEEP[count] / 65535, EXACT
