@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader
 
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene, evaluate, load, save
 from tests.tester import BaseTester
@@ -83,21 +82,6 @@ class TestCopies:
         assert torch.equal(empty(), scene())
 
 
-def identity(scenes: list[Scene]) -> list[Scene]:
-    return scenes
-
-
-@pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
-def test_items_of_a_data_loader() -> None:
-    """Scenes that were rendered come from a worker, and render alike on both sides."""
-    scenes = [make_scene(name) for name in MAPS]
-    images = [scene().detach() for scene in scenes]
-    loader = DataLoader(scenes, 5, num_workers=1, collate_fn=identity, multiprocessing_context="fork")  # type: ignore[arg-type]
-    (items,) = loader
-    for item, scene, image in zip(items, scenes, images, strict=True):
-        assert torch.equal(item(), image) and torch.equal(scene(), image) and item.metadata == scene.metadata
-        item().sum().backward()
-        assert item.field.means.grad is not None and item.field.means.grad.any()
 
 
 def scene_on(device: torch.device, dtype: torch.dtype, name: str = "soft") -> Scene:

@@ -95,12 +95,6 @@ def write_header(path: Path, header: dict[str, Any], body: bytes) -> None:
     path.write_bytes(struct.pack("<Q", len(text)) + text + body)
 
 
-def overwrite(path: Path, name: str, value: bytes) -> None:
-    """Write over the beginning of a tensor in a file, and leave out the checksum."""
-    header, body = read_header(path)
-    change_notes(checksum=None)(header)
-    start = header[name]["data_offsets"][0]
-    write_header(path, header, body[:start] + value + body[start + len(value) :])
 
 
 @pytest.fixture
@@ -170,12 +164,6 @@ class TestSave:
                     "notes": {"title": "a"},
                 }
             }
-
-    def test_a_scene_without_a_map_has_no_bytes_for_it(self, path: Path) -> None:
-        save(path, Scene(make_field(opacities=False)))
-        header, body = read_header(path)
-        assert header.keys() == {"__metadata__", "means", "cholesky", "colors", "region_ids"}
-        assert len(body) == 13 * (8 * 4 + 1) and not {"softness", "labels"} & read_notes(path).keys()
 
     @pytest.mark.parametrize("highest", [7, 1 << 40])
     def test_maps_are_small(self, path: Path, highest: int) -> None:
@@ -288,17 +276,17 @@ class TestLoad:
     @pytest.mark.parametrize(
         ("name", "value", "message"),
         [
-            ("means", struct.pack("<f", float("nan")), "means must be finite"),
             ("cholesky", struct.pack("<f", 0.0), "cholesky must have l11 > 0 and l22 > 0"),
-            ("region_ids", struct.pack("<i", -1), "region_ids must .*non-negative"),
             ("labels", b"\0", "labels must be a zlib stream; Error"),
         ],
     )
-    def test_bad_values(self, path: Path, name: str, value: bytes, message: str) -> None:
-        save(path, Scene(make_field(70_000), make_labels(70_000)))  # ids of int32
-        overwrite(path, name, value)
+    def test_bad_values(self, saved: Path, name: str, value: bytes, message: str) -> None:
+        header, body = read_header(saved)
+        change_notes(checksum=None)(header)
+        start = header[name]["data_offsets"][0]
+        write_header(saved, header, body[:start] + value + body[start + len(value) :])
         with pytest.raises(ValueError, match=message):
-            load(path)
+            load(saved)
 
     @pytest.mark.parametrize("content", [b"", b"\xff" * 64])
     def test_foreign_files(self, path: Path, content: bytes) -> None:

@@ -6,15 +6,14 @@ import random
 import re
 import tracemalloc
 import zlib
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from kcgs import RegionMap, Scene, load
+from kcgs import RegionMap, Scene
 from kcgs.codec import CodecError, Decoded, decode, decode_labels, encode, encode_labels
-from kcgs.codec.file import ByteReader, Header, pack, unpack, varint
+from kcgs.codec.file import Header, pack, unpack
 from kcgs.codec.gaussians.layers import LayerCoder
 from kcgs.codec.gaussians.occupancy import Grid, OccupancyCoder
 from kcgs.codec.gaussians.quantize import Quantizer
@@ -48,11 +47,6 @@ def assert_valid(decoded: Decoded) -> None:
         assert regions.size == field.size
 
 
-def write_count(regions: int) -> bytes:
-    """Begin the stream of a map."""
-    writer = Writer()
-    _code_count(writer, regions, regions)
-    return writer.finish()
 
 
 class TestDamagedScenes:
@@ -64,12 +58,6 @@ class TestDamagedScenes:
             num_cut += is_scene(mutated) and mutated != data
             num_forged += is_scene(damaged_inside(data, generator))
         assert num_cut > 0 and num_forged > 0
-
-    def test_flipped_bits(self, data: bytes) -> None:
-        for index in range(0, len(data), 7):
-            content = bytearray(data)
-            content[index] ^= 16
-            assert not is_scene(bytes(content))
 
     @pytest.mark.parametrize("step", [29, pytest.param(1, marks=pytest.mark.slow)])
     def test_cuts_are_coarser_scenes(self, step: int) -> None:
@@ -85,10 +73,6 @@ class TestDamagedScenes:
                 assert decoded.layers == sum(end <= length for end in ends) < decoded.num_layers
                 counts.append(decoded.scene.num_gaussians)
         assert counts == sorted(counts) and len({*counts}) == len(ends)
-
-    @pytest.mark.parametrize("data", [b"", b"kcgs", b"PNG0" * 9])
-    def test_other_files(self, data: bytes) -> None:
-        assert not is_scene(data)
 
     def test_surplus_bytes(self, data: bytes, scene: Scene) -> None:
         with pytest.raises(CodecError, match="the file must end after"):
@@ -118,17 +102,6 @@ class TestDamagedScenes:
         with pytest.raises(CodecError, match=match):
             decode(pack(header._replace(regions=regions), region_map, layers))
 
-    def test_many_regions_of_few_bytes(self, data: bytes) -> None:
-        header, _, layers = unpack(data)
-        labels = write_count(1 << 20)
-        header = header._replace(size=(1 << 10, 1 << 10), regions=1 << 20)
-        with pytest.raises(CodecError, match="at most 262145 regions; got 1048576"):
-            decode(pack(header, varint(len(labels)) + labels, layers))
-
-    def test_varints(self) -> None:
-        assert ByteReader(bytes([129, 128, 128, 128, 0])).varint("width", 0, 1) == 1
-        with pytest.raises(CodecError, match=r"width must be in \[0, 1\]; got a number of more than 35 bits"):
-            ByteReader(bytes([129, 128, 128, 128, 128, 0])).varint("width", 0, 1)
 
 
 @pytest.fixture(scope="module")
@@ -149,11 +122,6 @@ class TestDamagedMaps:
             if mutated != files[trial % 3]:
                 with pytest.raises(CodecError):
                     decode_labels(mutated)
-
-    def test_cuts(self, files: list[bytes]) -> None:
-        for length in range(4, len(files[0])):
-            with pytest.raises(CodecError, match="the file is damaged or ends early"):
-                decode_labels(files[0][:length])
 
     def test_right_checksums(self, files: list[bytes]) -> None:
         """What decodes is a map of the size and type that the file names."""
@@ -176,6 +144,7 @@ class TestDamagedMaps:
             (b"kcgs\1 and so on", "data must be a label map.*a scene, which kcgs.codec.decode reads"),
             (forge_map(64, b"\1\1", b""), "turn and type must be below 64; got 64"),
             (forge_map(0, b"\0\1", b""), r"height must be in \[1, 1048576\]; got 0"),
+            (forge_map(0, b"\x81\x80\x80\x80\x80\0", b""), "got a number of more than 35 bits"),
             (forge_map(0, b"\x80\x80\x40\x80\x80\x40", b""), "at most 67108864 pixels; got 1048576 x 1048576"),
             (forge_map(0, b"\1", b""), "the file ends early"),
             (forge_map(0, b"\1\1", b"\xff" * 4), "at most 1 regions; got 16777216 or more"),
@@ -198,14 +167,11 @@ class TestDamagedMaps:
 
     def test_many_regions_of_few_bytes(self) -> None:
         """They cost neither time nor memory."""
+        writer = Writer()
+        _code_count(writer, 1 << 20, 1 << 20)
         with pytest.raises(CodecError, match="at most 262145 regions; got 1048576"):
-            decode_labels(forge_map(0, b"\x80\x10\x80\x10", write_count(1 << 20)))
+            decode_labels(forge_map(0, b"\x80\x10\x80\x10", writer.finish()))
 
-    def test_in_place_of_a_scene(self, files: list[bytes], tmp_path: Path) -> None:
-        path = tmp_path / "mask.kcgs"
-        path.write_bytes(files[0])
-        with pytest.raises(ValueError, match=r"cannot load .*mask.kcgs: it is a label map, no scene: .*decode_labels"):
-            load(path)
 
 
 # errors of the stream of a layer

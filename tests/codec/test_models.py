@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-
 import numpy as np
 import torch
 from hypothesis import given, settings
@@ -24,12 +22,6 @@ class TestElementaryFunctions:
         assert np.abs(exp2(x) / np.exp2(x) - 1).max() < 1e-15
         cos, sin = cos_sin(share)
         assert max(np.abs(cos - np.cos(np.pi * share)).max(), np.abs(sin - np.sin(np.pi * share)).max()) < 1e-15
-
-    def test_same_bits_on_all_machines(self) -> None:
-        x = np.linspace(-40, 40, 9973)
-        values = np.concatenate([exp2(x), *cos_sin((x + 40) / 80)])
-        digest = hashlib.sha256(values.astype("<f8").tobytes()).hexdigest()
-        assert digest == "b49209ad81f58afac91381f953cee7cf27fe602f2af2f2f935b2bab284e1643f"
 
     def test_squash_does_not_depend_on_the_last_digit_of_exp(self) -> None:
         exact = 65536 / (1 + np.exp(-np.arange(-MAX_LOGIT, MAX_LOGIT + 1) / 256))

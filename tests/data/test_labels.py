@@ -7,9 +7,6 @@ import numpy as np
 import pytest
 import tifffile
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 from PIL import Image
 
 from kcgs.data import load_labels, save_labels
@@ -97,24 +94,11 @@ class TestLoadLabels:
 
 
 class TestSaveLabels:
-    @settings(max_examples=20)
-    @given(
-        values=st.sampled_from([(".png", 255), (".png", 65535), (".npy", 2**62)]).flatmap(
-            lambda kind: st.tuples(
-                st.just(kind[0]),
-                hnp.arrays(np.int64, hnp.array_shapes(min_dims=2, max_dims=2), elements=st.integers(0, kind[1])),
-            )
-        )
-    )
-    def test_round_trip(self, tmp_path: Path, values: tuple[str, np.ndarray]) -> None:
-        suffix, labels = values[0], torch.from_numpy(values[1])
+    @pytest.mark.parametrize(("suffix", "highest"), [(".png", 255), (".png", 65535), (".npy", 1 << 62)])
+    def test_round_trip(self, tmp_path: Path, suffix: str, highest: int) -> None:
+        labels = torch.tensor([[0, 3, highest], [3, 0, 9]])
         save_labels(tmp_path / f"a{suffix}", labels)
         assert torch.equal(load_labels(tmp_path / f"a{suffix}"), labels)
-
-    @pytest.mark.parametrize("dtype", [torch.uint8, torch.int32])
-    def test_integer_types(self, tmp_path: Path, dtype: torch.dtype) -> None:
-        save_labels(tmp_path / "a.png", torch.from_numpy(MAP).to(dtype))
-        np.testing.assert_array_equal(load_labels(tmp_path / "a.png"), MAP)
 
     def test_kinds_of_png(self, tmp_path: Path) -> None:
         save_labels(tmp_path / "a.png", torch.tensor([[0, 1, 255]]))
