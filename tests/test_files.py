@@ -35,7 +35,7 @@ class TestSave:
         assert Path("plain.kcgs").read_bytes() == encode(scene, **goal)
 
     def test_compression_with_an_image_gets_all_options(self, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-        options = {
+        options: dict[str, Any] = {
             "quality": 30.0, "target_bytes": 250, "target_psnr": 8.0, "objective": "l2", "seed": 1, "min_sigma": 1.5
         }  # fmt: skip
         calls = []

@@ -33,6 +33,7 @@ TRANSCRIPT = [
 ]
 
 
+@pytest.mark.filterwarnings("always")  # the command shows them
 @pytest.mark.usefixtures("photo")
 def test_transcript(kcgs: Kcgs) -> None:
     save_labels("wide.png", (torch.arange(120) > 50).long().expand(40, 120))
