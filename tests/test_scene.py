@@ -170,8 +170,7 @@ class TestScene(BaseTester):
         one = MAPS[name]
         maps = one if one is None or name == "hard" else batch_of(one)
         parts = [GaussianField.random(40, SIZE, regions=one, seed=seed) for seed in range(3)]
-        tensors = (torch.stack([getattr(f, t).detach() for f in parts]) for t in ("means", "cholesky", "colors"))
-        field = GaussianField(*tensors, size=SIZE)
+        field = GaussianField.stack(parts)
         batch = Scene(field if maps is None else field.assign_regions(maps), maps, {"title": name})
         assert repr(batch).startswith("Scene(3 x 40 Gaussians, 3 channels, ")
         scenes = tuple(batch)

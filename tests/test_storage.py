@@ -41,9 +41,10 @@ def make_field(
 
 
 def make_batch() -> GaussianField:
-    tensors = [torch.stack([getattr(make_field(), name).detach()] * 2) for name in TENSORS]
-    tensors[0][1] += 1.5
-    return GaussianField(*tensors, size=SIZE)
+    other = make_field()
+    with torch.no_grad():
+        other.means += 1.5
+    return GaussianField.stack([make_field(), other])
 
 
 def make_extreme_field(dtype: torch.dtype) -> GaussianField:

@@ -175,9 +175,7 @@ class TestRender:
             assert report == {"height": size[0], "width": size[1], "bytes": Path("a.png").stat().st_size}
 
     def test_a_batch_is_refused_by_its_name(self, kcgs: Kcgs) -> None:
-        scene = GaussianField.random(3, (8, 8), seed=0)
-        tensors = (torch.stack([t.detach(), t.detach()]) for t in scene.parameters())
-        Scene(GaussianField(*tensors, size=scene.size)).save("batch.safetensors")
+        Scene(GaussianField.stack([GaussianField.random(3, (8, 8), seed=0)] * 2)).save("batch.safetensors")
         assert json.loads(kcgs("info", "batch.safetensors", "--json").out)["images"] == 2
         for arguments in (("eval", "photo.png"), ("encode", "-o", "a.kcgs"), ("view",), ("export", "-o", "a.onnx")):
             code, _, err = kcgs(arguments[0], "batch.safetensors", *arguments[1:])

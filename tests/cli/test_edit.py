@@ -20,11 +20,7 @@ def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Scene:
     labels[2:6, 2:8], labels[8:14, 14:20] = 3, 7
     scene = Scene(GaussianField.random(30, (16, 24), regions=labels, seed=0), labels)
     scene.save("scene.safetensors")
-    field = scene.field
-    ids = field.region_ids
-    assert ids is not None
-    tensors = (torch.stack([t.detach()] * 2) for t in (field.means, field.cholesky, field.colors, ids))
-    Scene(GaussianField(*tensors, size=(16, 24)), torch.stack([labels] * 2)).save("batch.safetensors")
+    Scene(GaussianField.stack([scene.field] * 2), torch.stack([labels] * 2)).save("batch.safetensors")
     return scene
 
 
