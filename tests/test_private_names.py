@@ -71,7 +71,6 @@ def test_exists(name: str) -> None:
         pytest.fail(f"{(TORCH | NUMBA)[name]}: there is no {name}")
 
 
-
 @pytest.mark.parametrize(
     ("pattern", "home", "names"),
     [

@@ -82,8 +82,6 @@ class TestCopies:
         assert torch.equal(empty(), scene())
 
 
-
-
 def scene_on(device: torch.device, dtype: torch.dtype, name: str = "soft") -> Scene:
     """Make a scene of a dtype that a field may have."""
     return make_scene(name).to(device, torch.promote_types(dtype, torch.float32))

@@ -96,8 +96,6 @@ def write_header(path: Path, header: dict[str, Any], body: bytes) -> None:
     path.write_bytes(struct.pack("<Q", len(text)) + text + body)
 
 
-
-
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     return tmp_path / "scene.safetensors"

@@ -249,8 +249,6 @@ class TestBatches:
         assert code == 0 and len(lines) == 2 and lines[0].startswith("warning: a.png: 1 of 2 regions were merged")
 
 
-
-
 @contextmanager
 def interrupted_at_the_second_batch(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     fit_batch, numbers = many_shards.fit_batch, itertools.count(1)

@@ -87,7 +87,6 @@ def test_a_sealed_folder(kcgs: Kcgs, monkeypatch: pytest.MonkeyPatch) -> None:
     assert run.err.endswith("': Permission denied\n")
 
 
-
 @pytest.mark.parametrize("option", ["--scale=400", "--scale=1e6"])
 def test_renders_that_do_not_fit_into_memory(kcgs: Kcgs, monkeypatch: pytest.MonkeyPatch, option: str) -> None:
     monkeypatch.setattr("kcgs._memory.free_memory", lambda: 1e9)

@@ -21,7 +21,7 @@ from kcgs.codec.labels import stream
 from kcgs.codec.labels.ids import _code_count
 from kcgs.codec.rangecoder import Reader, Writer
 
-from .conftest import GOLDEN, make_labels, make_scene
+from .conftest import GOLDEN, make_labels
 from .damage import damaged, damaged_inside
 from .test_label_files import DTYPES
 
@@ -45,8 +45,6 @@ def assert_valid(decoded: Decoded) -> None:
     if regions is not None:
         assert field.region_ids is not None and (regions.index_of(field.region_ids) >= 0).all()
         assert regions.size == field.size
-
-
 
 
 class TestDamagedScenes:
@@ -101,7 +99,6 @@ class TestDamagedScenes:
         header, region_map, layers = unpack(data)
         with pytest.raises(CodecError, match=match):
             decode(pack(header._replace(regions=regions), region_map, layers))
-
 
 
 @pytest.fixture(scope="module")
@@ -171,7 +168,6 @@ class TestDamagedMaps:
         _code_count(writer, 1 << 20, 1 << 20)
         with pytest.raises(CodecError, match="at most 262145 regions; got 1048576"):
             decode_labels(forge_map(0, b"\x80\x10\x80\x10", writer.finish()))
-
 
 
 # errors of the stream of a layer

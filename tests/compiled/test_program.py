@@ -115,8 +115,6 @@ def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pyte
     assert not list(tmp_path.rglob("*.nb*"))
 
 
-
-
 def test_constant_of_another_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two checkouts share what they compile, unless a module differs that the loop takes a constant from."""
     monkeypatch.setattr(program._config, "CACHE_DIR", str(tmp_path / "cache"))
@@ -127,8 +125,6 @@ def test_constant_of_another_module(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         for module in ("scaling", "scaling.constants", "scaling.loops"):
             del sys.modules[module]
         assert len(list((tmp_path / "cache").rglob("*.nbc"))) == num_files
-
-
 
 
 @pytest.mark.parametrize(

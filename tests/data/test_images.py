@@ -154,7 +154,10 @@ class TestLoadImage:
     @pytest.mark.parametrize(
         ("kind", "orientation"),
         [
-            *(("JPEG", k) for k in range(1, 9)), ("TIFF", 6), ("16-bit PNG", 8), ("16-bit TIFF", 8),
+            *(("JPEG", k) for k in range(1, 9)),
+            ("TIFF", 6),
+            ("16-bit PNG", 8),
+            ("16-bit TIFF", 8),
         ],
     )
     def test_orientation(self, tmp_path: Path, kind: str, orientation: int) -> None:
