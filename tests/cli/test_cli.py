@@ -125,9 +125,9 @@ class TestFit:
         """They are refused before the image is read."""
         Path("photo.png").write_text("this is no image")
         for purpose, options in (("PSNR", ()), ("size", ("--target-bytes", 900))):
-            for setting, words in (("--recipe=paper", "l2 or ms-ssim"), ("--bounded", "False")):
+            for setting, value in (("--recipe=paper", "'l1'"), ("--bounded", "True")):
                 code, _, err = kcgs("fit", "photo.png", "-o", "photo.kcgs", *options, setting)
-                assert code == 2 and f"must be {words} for a file of a {purpose}" in err, err
+                assert code == 2 and f"for a file of a {purpose}; got {value}" in err, err
         assert "'--device': must be one that torch has" in kcgs("fit", "photo.png", "--device", "tpu").err
 
     def test_least_width_of_a_file(self, kcgs: Kcgs) -> None:

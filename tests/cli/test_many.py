@@ -220,23 +220,26 @@ class TestFailures:
 
 
 class TestBatches:
-    @pytest.mark.parametrize(("suffix", "batches"), [(".safetensors", ("1", "2", "auto")), (".kcgs", ("1", "auto"))])
-    def test_the_files_of_a_batch_are_those_of_images_alone(
-        self, fit_many: Kcgs, suffix: str, batches: tuple[str, ...]
-    ) -> None:
+    def test_the_files_of_a_batch_are_those_of_images_alone(self, fit_many: Kcgs) -> None:
         """Also with an image of another size, one that nobody can read, and one that lies on its side."""
         Image.new("RGB", (20, 30), "red").save("photos/tall.png")
-        turned = Image.open("photos/a.png").transpose(Image.Transpose.ROTATE_90)
         exif = Image.Exif()
         exif[274] = 6
-        turned.save("photos/turned.jpg", exif=exif)
-        arguments = ("photos", "broken", *SETTINGS, "--iterations", "10", "--suffix", suffix)
+        Image.open("photos/a.png").transpose(Image.Transpose.ROTATE_90).save("photos/turned.jpg", exif=exif)
+        batches = ("1", "2", "auto")
         for batch in batches:
-            code, _, err = fit_many(*arguments, "-o", batch, "--batch", batch)
+            code, _, err = fit_many("photos", "broken", *SETTINGS, "--iterations", "10", "-o", batch, "--batch", batch)
             assert code == 1 and err.startswith("kcgs: d.png: ")
         for stem in ("a", "b", "c", "tall", "turned"):
-            assert len({Path(batch, f"{stem}{suffix}").read_bytes() for batch in batches}) == 1
-        assert not Path("auto", f"d{suffix}").exists()
+            assert len({Path(batch, f"{stem}.safetensors").read_bytes() for batch in batches}) == 1
+        assert not Path("auto/d.safetensors").exists()
+
+    def test_compressed_files(self, fit_many: Kcgs) -> None:
+        for batch in ("1", "2"):
+            arguments = ("photos/a.png", "photos/b.png", *SETTINGS, "--suffix", ".kcgs", "-o", batch, "--batch", batch)
+            assert fit_many(*arguments).code == 0
+        for name in ("a.kcgs", "b.kcgs"):
+            assert Path("1", name).read_bytes() == Path("2", name).read_bytes()
 
     def test_an_error_of_the_fit_stops_one_image(self, fit_many: Kcgs, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(many_jobs, "fit_batch", lambda *_: 1 / 0)
