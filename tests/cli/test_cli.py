@@ -76,8 +76,6 @@ class TestFit:
         field = load("scene.safetensors").field
         assert ((field.means >= 0) & (field.means <= torch.tensor([60.0, 40.0]))).all()
         assert field.colors.min() >= -1 and field.colors.max() <= 2
-        code, _, err = kcgs("fit", "photo.png", "--target-bytes", 300, "--bounded")
-        assert code == 2 and "must be False for a file of a size; got True" in err
 
     def test_keep_contours(self, kcgs: Kcgs) -> None:
         assert "\nregions: 2 of 2 regions kept\n" in kcgs(*FIT, "--regions", "mask.png", "--keep-contours").out
@@ -116,11 +114,6 @@ class TestFit:
         assert err == f"kcgs: --target-psnr 90 was not reached: {report['psnr']:.2f} dB is the best\n"
         assert float(psnr(load(f"s.{suffix}").render(), load_image("photo.png"))) == pytest.approx(report["psnr"])
 
-    def test_compressed_file(self, kcgs: Kcgs) -> None:
-        arguments = ("--regions", "none", "-n", "60", "--target-psnr", "20")
-        assert kcgs(*FIT[:-1], "photo.kcgs", *arguments).code == 0
-        assert float(psnr(load("photo.kcgs").render(), load_image("photo.png"))) >= 20
-
     def test_target_bytes(self, kcgs: Kcgs) -> None:
         arguments = ("--regions", "none", "--iterations", "5", "--target-bytes", "200")
         report = json.loads(kcgs("fit", "photo.png", *arguments, "--json").out)
@@ -128,19 +121,13 @@ class TestFit:
         assert report["num_gaussians"] == load("photo.kcgs").num_gaussians
         assert report["bits_per_pixel"] == pytest.approx(8 * report["bytes"] / (40 * 60))
 
-    def test_a_file_lowers_what_the_fit_does(self, kcgs: Kcgs) -> None:
-        """L1 it cannot lower, and says so before the fit."""
-        code, _, err = kcgs(*FIT[:-1], "photo.kcgs", "--recipe", "paper", "--iterations", 10**9)
-        assert code == 2 and "must be l2 or ms-ssim for a file of a PSNR; got 'l1'" in err
-        assert kcgs(*FIT[:-1], "photo.kcgs", "--recipe", "paper", "--objective", "l2").code == 0
-
     def test_settings_that_a_file_does_not_take(self, kcgs: Kcgs) -> None:
         """They are refused before the image is read."""
         Path("photo.png").write_text("this is no image")
         for purpose, options in (("PSNR", ()), ("size", ("--target-bytes", 900))):
-            for setting, words in (("--objective=l1", "l2"), ("--bounded", f"must be False for a file of a {purpose}")):
+            for setting, value in (("--recipe=paper", "'l1'"), ("--bounded", "True")):
                 code, _, err = kcgs("fit", "photo.png", "-o", "photo.kcgs", *options, setting)
-                assert code == 2 and words in err, err
+                assert code == 2 and f"for a file of a {purpose}; got {value}" in err, err
         assert "'--device': must be one that torch has" in kcgs("fit", "photo.png", "--device", "tpu").err
 
     def test_least_width_of_a_file(self, kcgs: Kcgs) -> None:
@@ -188,9 +175,7 @@ class TestRender:
             assert report == {"height": size[0], "width": size[1], "bytes": Path("a.png").stat().st_size}
 
     def test_a_batch_is_refused_by_its_name(self, kcgs: Kcgs) -> None:
-        scene = GaussianField.random(3, (8, 8), seed=0)
-        tensors = (torch.stack([t.detach(), t.detach()]) for t in scene.parameters())
-        Scene(GaussianField(*tensors, size=scene.size)).save("batch.safetensors")
+        Scene(GaussianField.stack([GaussianField.random(3, (8, 8), seed=0)] * 2)).save("batch.safetensors")
         assert json.loads(kcgs("info", "batch.safetensors", "--json").out)["images"] == 2
         for arguments in (("eval", "photo.png"), ("encode", "-o", "a.kcgs"), ("view",), ("export", "-o", "a.onnx")):
             code, _, err = kcgs(arguments[0], "batch.safetensors", *arguments[1:])
@@ -214,22 +199,16 @@ class TestFailures:
         [
             ((), 2, "Usage"),
             (("fitt",), 2, "fitt"),
-            (("fit",), 2, "Missing argument"),
-            (("fit", "photo.png", "b.png"), 2, "extra argument(s) (b.png)"),
             (("fit", "photo.png", "-n", "0"), 2, "greater than or equal to 1"),
             (("fit", "photo.png", "-n", "10000"), 2, "must be at most 2400, the pixels of the 60 x 40 image"),
             (("fit", "photo.png", "--objective", "visual"), 2, "one of l2, l1, ms-ssim; got 'visual'"),
             (("fit", "photo.png", "--objective", "psnr"), 2, "got 'psnr', which is now 'l2'"),
-            (("fit", "nothing.png"), 2, "nothing.png"),
             (("fit", "text.png"), 1, "text.png"),
             (("fit", "photo.png", "--recipe", "none-such"), 2, "'--recipe': must be one of"),
             (("fit", "photo.png", "--regions", "nothing.png"), 2, "No such file or directory: nothing.png"),
             (("fit", "photo.png", "--regions", "small.png"), 2, "'--regions': must be one map of the image's size"),
-            (("fit", "photo.png", "-o", "scene.pt"), 2, "must end in .safetensors"),
             (("fit", "photo.png", "-o", "scene.KCGS"), 2, "must end in .safetensors"),
-            (("fit", "photo.png", "-o", "nowhere/scene.safetensors"), 2, "needs an existing folder"),
             (("fit", "photo.png", "--max-seconds", "-1"), 2, "'--max-seconds': must be greater than 0; got -1.0"),
-            (("fit", "photo.png", "--target-psnr", "-3"), 2, "'--target-psnr': must be greater than 0; got -3.0"),
             (("fit", "photo.png", "-n", "5", "--target-bytes", "90"), 2, "must be left out with --target-bytes; got 5"),
             (("fit", "photo.png", "--target-bytes", "90", "-o", "a.safetensors"), 2, "must end in .kcgs"),
             (("fit", "folder"), 2, "'IMAGE': file 'folder' is a directory"),

@@ -121,8 +121,7 @@ class TestView:
         with pytest.raises(urllib.error.HTTPError, match="403"):
             urllib.request.urlopen(urllib.request.Request(url, headers={"Host": "elsewhere.example"}))
 
-    @pytest.mark.parametrize("suffix", ["safetensors", "kcgs"])
-    def test_opens_the_page_of_a_scene(self, kcgs: Kcgs, monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
+    def test_opens_the_page_of_a_scene(self, kcgs: Kcgs, monkeypatch: pytest.MonkeyPatch) -> None:
         urls: list[str] = []
 
         def interrupt(self: object) -> None:
@@ -130,12 +129,8 @@ class TestView:
 
         monkeypatch.setattr("webbrowser.open", urls.append)
         monkeypatch.setattr("socketserver.BaseServer.serve_forever", interrupt)
-        code, out, _ = kcgs("view", f"scene.{suffix}")
+        code, out, _ = kcgs("view", "scene.kcgs")
         assert (code, out) == (130, f"{urls[0]} (Ctrl-C ends)\n")
-
-    def test_a_decoder_is_no_scene(self, kcgs: Kcgs) -> None:
-        code, _, err = kcgs("view", "decoder.onnx")
-        assert code == 2 and ".safetensors or .kcgs" in err
 
 
 def test_models(kcgs: Kcgs) -> None:

@@ -20,11 +20,7 @@ def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Scene:
     labels[2:6, 2:8], labels[8:14, 14:20] = 3, 7
     scene = Scene(GaussianField.random(30, (16, 24), regions=labels, seed=0), labels)
     scene.save("scene.safetensors")
-    field = scene.field
-    ids = field.region_ids
-    assert ids is not None
-    tensors = (torch.stack([t.detach()] * 2) for t in (field.means, field.cholesky, field.colors, ids))
-    Scene(GaussianField(*tensors, size=(16, 24)), torch.stack([labels] * 2)).save("batch.safetensors")
+    Scene(GaussianField.stack([scene.field] * 2), torch.stack([labels] * 2)).save("batch.safetensors")
     return scene
 
 
@@ -58,11 +54,10 @@ def test_batch(kcgs: Kcgs, scene: Scene) -> None:
     assert torch.equal(load("new.safetensors").render(), expected.render())
 
 
-@pytest.mark.parametrize("name", ["scene", "batch"])
-def test_recolor(kcgs: Kcgs, scene: Scene, name: str) -> None:
-    code, _, err = kcgs("edit", f"{name}.safetensors", "--recolor", "7=#0000ff", "-o", "new.safetensors")
+def test_recolor(kcgs: Kcgs, scene: Scene) -> None:
+    code, _, err = kcgs("edit", "batch.safetensors", "--recolor", "7=#0000ff", "-o", "new.safetensors")
     assert code == 0, err
-    expected = editing.recolor_region(load(f"{name}.safetensors"), 7, color="#0000ff")
+    expected = editing.recolor_region(load("batch.safetensors"), 7, color="#0000ff")
     assert torch.equal(load("new.safetensors").render(), expected.render())
 
 
@@ -77,12 +72,10 @@ def test_compressed_file(kcgs: Kcgs, scene: Scene) -> None:
         ((), "needs --delete, --recolor or --move"),
         (("--delete", "5"), "'--delete': must be among the 3 ids of the map, 0, 3, 7; got 5"),
         (("--delete", "3", "--move", "3=1,1"), "'--move': must be among the 2 ids of the map, 0, 7; got 3"),
-        (("--delete", "three"), "'--delete': Input should be a valid integer"),
         (("--move", "3=1"), "'--move': must be ID=DX,DY in pixels, such as 1=40,0; got '3=1'"),
         (("--move", "3=0.5,0"), "'--move': must be whole multiples of 1 pixel"),
         (("--recolor", "#ff0000"), "'--recolor': must be ID=COLOR, such as 2=#ff0000; got '#ff0000'"),
         (("--recolor", "3=reddish"), "'--recolor': must be a name such as red or #ff0000; got 'reddish'"),
-        (("--recolor", "9=red"), "'--recolor': must be among"),
         (("--recolor", "3=#ff0000", "--no-fill"), "'--no-fill': must be left out with --recolor alone"),
     ],
 )

@@ -41,12 +41,12 @@ class TestEncode:
 
     def test_with_the_image(self, kcgs: Kcgs) -> None:
         files = []
-        for options in ([], ["--image", "photo.png"], ["--image", "photo.png", "--objective", "l2"]):
-            arguments = ["encode", "scene.safetensors", "-o", "a.kcgs", "--target-bytes", 300, *options]
-            assert kcgs(*arguments).code == 0
+        for options in ([], ["--objective", "l2"]):
+            arguments = ["encode", "scene.safetensors", "-o", "a.kcgs", "--image", "photo.png", "--target-bytes", 300]
+            assert kcgs(*arguments, *options).code == 0
             files.append(Path("a.kcgs").read_bytes())
             assert len(files[-1]) <= 300
-        assert len(set(files)) == 3
+        assert files[0] != files[1]
 
     @pytest.mark.parametrize(
         ("arguments", "code", "words"),

@@ -77,8 +77,6 @@ class TestFitVideo:
         ("arguments", "code", "words"),
         [
             (("-o", "a.kcgs"), 2, "must end in .safetensors"),
-            (("--regions", "nothing.png"), 2, "nothing.png"),
-            (("--max-seconds", "3"), 2, "No such option"),
             (("-o", "mask.png/scenes", "--regions", "nothing.png"), 2, "--output needs an existing folder"),
             (("--objective", "l1", "--regions", "nothing.png"), 2, "'--objective': must be l2 or ms-ssim for a video"),
         ],

@@ -37,7 +37,7 @@ def damaged_inside(data: bytes, generator: random.Random, other: bytes = b"") ->
         index = generator.randrange(len(layers))
         layers[index] = damaged(layers[index], generator, other) or b"\0"
     elif kind == 2:
-        sizes = [(1, 1), (7, 9), (300, 400), (1 << 20, 1), (1 << 20, 1 << 20)]
+        sizes = [(1, 1), (7, 9), (300, 400), (1 << 16, 1), (1 << 20, 1 << 20)]
         header = header._replace(size=generator.choice(sizes))
     else:
         fields = {"channels": [1, 2, 4, 900], "qp": [-512, 0, 1023], "regions": [1, 2, 4, 70000]}

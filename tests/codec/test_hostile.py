@@ -3,29 +3,25 @@
 from __future__ import annotations
 
 import random
+import re
 import tracemalloc
 import zlib
-from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from kcgs import RegionMap, Scene, load
+from kcgs import RegionMap, Scene
 from kcgs.codec import CodecError, Decoded, decode, decode_labels, encode, encode_labels
-from kcgs.codec.exact import Integers
-from kcgs.codec.file import ByteReader, Header, pack, unpack, varint
-from kcgs.codec.gaussians.layers import Group, LayerCoder
+from kcgs.codec.file import Header, pack, unpack
+from kcgs.codec.gaussians.layers import LayerCoder
 from kcgs.codec.gaussians.occupancy import Grid, OccupancyCoder
-from kcgs.codec.gaussians.quantize import Classes, Codes, Quantizer
+from kcgs.codec.gaussians.quantize import Quantizer
 from kcgs.codec.labels import stream
 from kcgs.codec.labels.ids import _code_count
 from kcgs.codec.rangecoder import Reader, Writer
-from kcgs.codec.scenes import SceneWriter
 
-from .conftest import GOLDEN, make_labels, make_scene
+from .conftest import GOLDEN, make_labels
 from .damage import damaged, damaged_inside
 from .test_label_files import DTYPES
 
@@ -51,15 +47,8 @@ def assert_valid(decoded: Decoded) -> None:
         assert regions.size == field.size
 
 
-def write_count(regions: int) -> bytes:
-    """Begin the stream of a map."""
-    writer = Writer()
-    _code_count(writer, regions, regions)
-    return writer.finish()
-
-
 class TestDamagedScenes:
-    @pytest.mark.parametrize(("count", "seed"), [(100, 0), pytest.param(10_000, 1, marks=pytest.mark.slow)])
+    @pytest.mark.parametrize(("count", "seed"), [(40, 0), pytest.param(10_000, 1, marks=pytest.mark.slow)])
     def test_any_damage(self, count: int, seed: int) -> None:
         data, generator, num_cut, num_forged = GOLDEN.read_bytes(), random.Random(seed), 0, 0
         for _ in range(count // 2):
@@ -67,12 +56,6 @@ class TestDamagedScenes:
             num_cut += is_scene(mutated) and mutated != data
             num_forged += is_scene(damaged_inside(data, generator))
         assert num_cut > 0 and num_forged > 0
-
-    def test_flipped_bits(self, data: bytes) -> None:
-        for index in range(0, len(data), 7):
-            content = bytearray(data)
-            content[index] ^= 16
-            assert not is_scene(bytes(content))
 
     @pytest.mark.parametrize("step", [29, pytest.param(1, marks=pytest.mark.slow)])
     def test_cuts_are_coarser_scenes(self, step: int) -> None:
@@ -89,10 +72,6 @@ class TestDamagedScenes:
                 counts.append(decoded.scene.num_gaussians)
         assert counts == sorted(counts) and len({*counts}) == len(ends)
 
-    @pytest.mark.parametrize("data", [b"", b"k", b"kcgs", b"kcgs\2", b"PNG0" * 9, bytes(100)])
-    def test_other_files(self, data: bytes) -> None:
-        assert not is_scene(data)
-
     def test_surplus_bytes(self, data: bytes, scene: Scene) -> None:
         with pytest.raises(CodecError, match="the file must end after"):
             decode(data + b"\0")
@@ -107,9 +86,8 @@ class TestDamagedScenes:
             decode(pack(header._replace(layers=(header.layers[0],) * 129), region_map, [layers[0]] * 129))
         with pytest.raises(CodecError, match="an image with regions must have at most 67108864 pixels"):
             decode(pack(header._replace(size=(1 << 20, 1 << 20)), region_map, layers))
-        for version in (0, 2, 3):
-            with pytest.raises(CodecError, match=f"its version must be 1; got {version}"):
-                decode(b"kcgs" + bytes([version]) + data[5:])
+        with pytest.raises(CodecError, match="its version must be 1; got 2"):
+            decode(b"kcgs\2" + data[5:])
 
     @pytest.mark.parametrize(
         ("regions", "match"),
@@ -121,18 +99,6 @@ class TestDamagedScenes:
         header, region_map, layers = unpack(data)
         with pytest.raises(CodecError, match=match):
             decode(pack(header._replace(regions=regions), region_map, layers))
-
-    def test_many_regions_of_few_bytes(self, data: bytes) -> None:
-        header, _, layers = unpack(data)
-        labels = write_count(1 << 20)
-        header = header._replace(size=(1 << 10, 1 << 10), regions=1 << 20)
-        with pytest.raises(CodecError, match="at most 262145 regions; got 1048576"):
-            decode(pack(header, varint(len(labels)) + labels, layers))
-
-    def test_varints(self) -> None:
-        assert ByteReader(bytes([129, 128, 128, 128, 0])).varint("width", 0, 1) == 1
-        with pytest.raises(CodecError, match=r"width must be in \[0, 1\]; got a number of more than 35 bits"):
-            ByteReader(bytes([129, 128, 128, 128, 128, 0])).varint("width", 0, 1)
 
 
 @pytest.fixture(scope="module")
@@ -148,16 +114,11 @@ def forge_map(form: int, size: bytes, stream: bytes) -> bytes:
 class TestDamagedMaps:
     def test_any_damage(self, files: list[bytes]) -> None:
         generator = random.Random(0)
-        for trial in range(1_000):
+        for trial in range(300):
             mutated = damaged(files[trial % 3], generator)
             if mutated != files[trial % 3]:
                 with pytest.raises(CodecError):
                     decode_labels(mutated)
-
-    def test_cuts(self, files: list[bytes]) -> None:
-        for length in range(4, len(files[0])):
-            with pytest.raises(CodecError, match="the file is damaged or ends early"):
-                decode_labels(files[0][:length])
 
     def test_right_checksums(self, files: list[bytes]) -> None:
         """What decodes is a map of the size and type that the file names."""
@@ -180,6 +141,7 @@ class TestDamagedMaps:
             (b"kcgs\1 and so on", "data must be a label map.*a scene, which kcgs.codec.decode reads"),
             (forge_map(64, b"\1\1", b""), "turn and type must be below 64; got 64"),
             (forge_map(0, b"\0\1", b""), r"height must be in \[1, 1048576\]; got 0"),
+            (forge_map(0, b"\x81\x80\x80\x80\x80\0", b""), "got a number of more than 35 bits"),
             (forge_map(0, b"\x80\x80\x40\x80\x80\x40", b""), "at most 67108864 pixels; got 1048576 x 1048576"),
             (forge_map(0, b"\1", b""), "the file ends early"),
             (forge_map(0, b"\1\1", b"\xff" * 4), "at most 1 regions; got 16777216 or more"),
@@ -202,220 +164,72 @@ class TestDamagedMaps:
 
     def test_many_regions_of_few_bytes(self) -> None:
         """They cost neither time nor memory."""
+        writer = Writer()
+        _code_count(writer, 1 << 20, 1 << 20)
         with pytest.raises(CodecError, match="at most 262145 regions; got 1048576"):
-            decode_labels(forge_map(0, b"\x80\x10\x80\x10", write_count(1 << 20)))
-
-    def test_in_place_of_a_scene(self, files: list[bytes], tmp_path: Path) -> None:
-        path = tmp_path / "mask.kcgs"
-        path.write_bytes(files[0])
-        with pytest.raises(ValueError, match=r"cannot load .*mask.kcgs: it is a label map, no scene: .*decode_labels"):
-            load(path)
+            decode_labels(forge_map(0, b"\x80\x10\x80\x10", writer.finish()))
 
 
-class Forger(Writer):
-    """Writes any numbers as such that a file can hold."""
-
-    is_reader = True
-
-    def __init__(self, generator: np.random.Generator) -> None:
-        super().__init__()
-        self._generator = generator
-
-    def uniform(self, sizes: Any, values: Any) -> Any:
-        return super().uniform(sizes, values % sizes)
-
-    def number(self, value: int, size: int) -> int:
-        return super().number(int(self._generator.integers(size) * self._generator.integers(2)), size)
-
-    def mixed_categorical(self, tables: Any, rows: Any, values: Any) -> Any:
-        return super().mixed_categorical(tables, rows, values % tables.shape[1])
-
-
-class ForgedOccupancy(OccupancyCoder):
-    """Invents the cells of as many Gaussians as the layer names."""
-
-    def code(self, coder: Any, size: int, cell: Any) -> Any:
-        count, generator = len(cell), coder._generator
-        grid = Grid.for_count(self._size, count)
-        margin = generator.choice([0, 1, grid.max_margin])
-        corner, end = np.array([-margin, -margin]), np.array([grid.columns + margin, grid.rows + margin])
-        cell = corner + (generator.random((count, 2)) ** generator.choice([1, 9]) * (end - corner)).astype(np.int64)
-        return super().code(coder, size, cell[np.lexsort(cell.T)])
-
-
-class ForgedLayers(LayerCoder):
-    """Names any classes of size, but few Gaussians of each, which have any numbers."""
-
-    generator: np.random.Generator
-
-    def _code_counts(self, coder: Any, sizes: Any) -> Any:
-        counts = np.zeros(64, np.int64)
-        counts[coder._generator.choice([0, 1, 20, 35, 36], 2)] = coder._generator.integers(1, 80, 2)
-        return super()._code_counts(coder, np.repeat(np.arange(64), counts) - 8)
-
-    def _placeholders(self, count: int) -> Group:
-        codes, ids = super()._placeholders(count)
-        most = self.generator.choice([1, 2, 1 << 20], len(codes))
-        return Codes(*(self.generator.integers(-1, n, c.shape) for n, c in zip(most, codes, strict=True))), ids
-
-
-def forge(header: Header, generator: np.random.Generator) -> bytes:
-    """Write layers of random numbers, up to one that even their writer refuses."""
-    quantizer = Quantizer(header.qp, header.size)
-    model, layers, energies = ForgedLayers(quantizer, header.channels, None), [], []
-    model._occupancy, model.generator = ForgedOccupancy(header.size), generator
-    for energy, _ in header.layers:
-        forger = Forger(generator)
-        try:
-            model.read(forger, energy, 5000)
-        except CodecError:
-            break
-        layers.append(forger.finish().ljust(600, b"\0"))
-        energies.append((energy, len(layers[-1])))
-    return pack(header._replace(layers=tuple(energies)), b"", layers) if layers else b""
+# errors of the stream of a layer
+REFUSALS = (
+    "a class of size must be at most 28",
+    "a layer must hold Gaussians; got none",
+    "a layer must hold at most",
+    "a class of energy must be at least -24; got -25",
+    "a margin must be at most",
+    "Gaussians may lie outside",
+    "cells must hold at most the",
+    r"cells must hold \d+ Gaussians; got",
+)
 
 
 def test_any_number_that_a_file_can_hold() -> None:
-    generator, num_valid = np.random.default_rng(0), 0
-    for _ in range(70):
-        energies = np.unique(generator.choice([-24, -23, 0, 5, 39, 40], 3))[::-1]
+    """Random numbers after the counts of a few Gaussians, or at once: each of these errors, or a valid scene."""
+    generator, num_valid, messages = np.random.default_rng(0), 0, set()
+    for _ in range(600):
         size = [(1, 1), (7, 9), (300, 400), (1, 1 << 20), (1 << 20, 1 << 20)][generator.integers(5)]
-        qp, channels = generator.choice([-512, 0, 300, 1023]), generator.choice([1, 3, 4, 20])
-        data = forge(Header(size, int(channels), int(qp), 1, tuple((int(e), 1) for e in energies)), generator)
-        if data:
-            assert_valid(decode(data))
+        options = [1, 3, 4, 20], [-512, 0, 1023], [-24, 0, 40], [0, 1, 1, 2, 3, 20]
+        channels, qp, energy, count = (int(generator.choice(numbers)) for numbers in options)
+        writer, model = Writer(), LayerCoder(Quantizer(qp, size), channels, None)
+        if count:
+            model._code_counts(writer, generator.choice([-8, 0, 12, 28], count))
+        writer.uniform(np.full(100, 1 << 16), generator.integers(1 << 16, size=100))
+        layer = writer.finish()
+        try:
+            assert_valid(decode(pack(Header(size, channels, qp, 1, ((energy, len(layer)),)), b"", [layer])))
             num_valid += 1
+        except CodecError as error:
+            messages.add(str(error))
     assert num_valid > 10
-
-
-def write_counts(first: int, count: int, writer: Writer | None = None) -> Writer:
-    """Begin a layer of one class of size, by its position."""
-    writer, one = Writer() if writer is None else writer, np.ones(1, np.int64)
-    writer.uniform(64 * one, first * one)
-    writer.uniform((64 - first) * one, 0 * one)
-    LayerCoder(Quantizer(0, (9, 9)), 1, None)._count.code(writer, count)
-    return writer
-
-
-def refuse(writer: Writer, match: str, size: tuple[int, int] = (9, 9), qp: int = 0, energy: int = 0) -> None:
-    """A file of this one layer is a CodecError."""
-    layer = writer.finish()
-    with pytest.raises(CodecError, match=match):
-        decode(pack(Header(size, 1, qp, 1, ((energy, len(layer)),)), b"", [layer]))
-
-
-@pytest.mark.parametrize("position", [37, 63])
-def test_an_unknown_class_of_size(position: int) -> None:
-    refuse(write_counts(position, 1), "a class of size must be at most 28")
-
-
-def test_an_empty_group() -> None:
-    refuse(write_counts(5, 0), "a layer must hold Gaussians; got none")
+    assert not [refusal for refusal in REFUSALS if not any(re.search(refusal, message) for message in messages)]
 
 
 def test_a_ratio_beyond_all() -> None:
-    writer, zero = write_counts(5, 1), np.zeros(1, np.int64)
-    model = LayerCoder(Quantizer(-512, (9, 9)), 1, None)
+    writer, zero, model = Writer(), np.zeros(1, np.int64), LayerCoder(Quantizer(-512, (9, 9)), 1, None)
+    model._code_counts(writer, zero - 3)
     model._occupancy.code(writer, -3, np.zeros((1, 2), np.int64))
     model._ratio.code(writer, np.ones(1), zero, zero, zero + (1 << 23))
-    refuse(writer, "a ratio must be at most 0 steps", qp=-512, energy=-24)
+    layer = writer.finish()
+    with pytest.raises(CodecError, match="a ratio must be at most 0 steps"):
+        decode(pack(Header((9, 9), 1, -512, 1, ((-24, len(layer)),)), b"", [layer]))
 
 
-def write_nothing(size: tuple[int, int], count: int) -> bytes:
-    """Name Gaussians of a class of size, but cells that hold none."""
-    writer, grid = write_counts(5, count), Grid.for_count(size, count)
+def test_many_cells_take_little_memory() -> None:
+    """A row of cells is in memory, with as many as may lie near it. The file names Gaussians, but cells hold none."""
+    size, count = (1 << 10, 1 << 10), 60_000
+    writer, grid = Writer(), Grid.for_count(size, count)
+    LayerCoder(Quantizer(0, size), 1, None)._code_counts(writer, np.full(count, -3))
     OccupancyCoder(size)._code_margin(writer, grid, np.zeros((1, 2), np.int64))
-    cells, chance = grid.rows * grid.columns, 65536 * count / (count + grid.rows * grid.columns)
+    cells = grid.rows * grid.columns
     for _ in range(0, cells, 65536):
-        writer.bits(np.full(65536, np.floor(chance) / 65536), np.zeros(65536, np.int32))
+        writer.bits(np.full(65536, (65536 * count // (count + cells)) / 65536), np.zeros(65536, np.int32))
     layer = writer.finish().ljust(count // 8, b"\0")
-    return pack(Header(size, 1, 0, 1, ((0, len(layer)),)), b"", [layer])
-
-
-# a row of cells is in memory, with as many as may lie near it
-@pytest.mark.parametrize(
-    ("size", "max_bytes"), [((1 << 20, 1), 10e6), ((1 << 10, 1 << 10), 10e6), ((1, 1 << 20), 70e6)]
-)
-def test_many_cells_take_little_memory(size: tuple[int, int], max_bytes: float) -> None:
-    data = write_nothing(size, 60_000)
+    data = pack(Header(size, 1, 0, 1, ((0, len(layer)),)), b"", [layer])
     tracemalloc.start()
     with pytest.raises(CodecError, match="cells must hold 60000 Gaussians; got 0"):
         decode(data)
-    assert tracemalloc.get_traced_memory()[1] < max_bytes
+    assert tracemalloc.get_traced_memory()[1] < 10e6
     tracemalloc.stop()
-
-
-class Scripted(Writer):
-    """Writes these symbols after groups, in place of the true ones."""
-
-    def __init__(self, *symbols: int) -> None:
-        super().__init__()
-        self._symbols = list(symbols)
-
-    def number(self, value: int, size: int) -> int:
-        return super().number(self._symbols.pop(0), size)
-
-
-def make_group(quantizer: Quantizer, energy: int, count: int = 5) -> Group:
-    """Round Gaussians as if they had this energy."""
-    writer = SceneWriter(make_scene(count, quantizer.size, 1, channels=1))
-    classes = Classes(np.full(count, energy), np.zeros(count, np.int64))
-    codes = quantizer.quantize(writer.gaussians, classes)
-    return codes.select(np.lexsort(codes.cell.T)), writer.ids
-
-
-@pytest.mark.parametrize(("energy", "symbols"), [(-24, [1]), (-24, [2]), (-23, [1, 1]), (-22, [2, 2, 2])])
-def test_an_energy_below_all(energy: int, symbols: list[int]) -> None:
-    writer, quantizer, message = Scripted(*symbols), Quantizer(0, (9, 9)), "must be at least -24; got -25"
-    groups = [make_group(quantizer, energy - i) for i in range(1 + symbols[:-1].count(1))]
-    with pytest.raises(CodecError, match=message):
-        LayerCoder(quantizer, 1, None).write(writer, groups)
-    refuse(writer, message, energy=energy)
-
-
-def test_too_many_gaussians() -> None:
-    writer, quantizer = Writer(), Quantizer(0, (9, 9))
-    model = LayerCoder(quantizer, 1, None)
-    model._code_group(writer, 0, make_group(quantizer, 0), 5)
-    writer.number(1, 3)
-    model._code_counts(writer, np.zeros(5000, np.int64))
-    layer = writer.finish()
-    with pytest.raises(CodecError, match=f"a layer must hold at most {8 * len(layer) + 64 - 5} Gaussians; got 5000"):
-        decode(pack(Header((9, 9), 1, 0, 1, ((0, len(layer)),)), b"", [layer]))
-
-
-class ConstantBits(Writer):
-    """Writes one bit in place of all."""
-
-    def __init__(self, bit: int) -> None:
-        super().__init__()
-        self.bit = bit
-
-    def bits(self, chances: Any, values: Any) -> Any:
-        return super().bits(chances, np.full(len(chances), self.bit, np.int32))
-
-
-@pytest.mark.parametrize(
-    ("margin", "num_outside", "bit", "match"),
-    [
-        (0, 0, 0, "cells must hold 2 Gaussians; got 0"),
-        (0, 0, 1, "cells must hold at most the 2 Gaussians that remain; got more"),
-        (1, 2, 0, "cells must hold 2 Gaussians; got 0"),
-        (1, 2, 1, "cells must hold at most the 2 Gaussians that remain; got more"),
-        (1, 3, 0, "at most 2 Gaussians may lie outside; got 3"),
-        (255, 0, 0, "a margin must be at most 177 cells; got 255"),
-    ],
-)
-def test_wrong_numbers_of_gaussians_in_cells(margin: int, num_outside: int, bit: int, match: str) -> None:
-    writer, model = write_counts(5, 2, ConstantBits(bit)), OccupancyCoder((9, 9))
-    models = model._margin, model._num_outside
-    model._margin, model._num_outside = (  # type: ignore[assignment]
-        SimpleNamespace(code=lambda coder, _, number=number, value=value: number.code(coder, value))
-        for number, value in zip(models, (margin, num_outside), strict=True)
-    )
-    with pytest.raises(CodecError, match=match):
-        model.code(writer, -3, np.zeros((2, 2), np.int64))
-    refuse(writer, match)
 
 
 def test_too_many_cells_outside(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -433,37 +247,3 @@ def test_too_many_cells_outside(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(f"{OccupancyCoder.__module__}._MAX_CLASSES", 4)
     with pytest.raises(CodecError, match="at most 4 classes of size; got more"):
         decoder.code(reader, 4, far)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (5, 7), (1, 300), (64, 48)])
-@pytest.mark.parametrize("margin", [0, 1, 6])
-def test_split_and_join_cells(size: tuple[int, int], margin: int) -> None:
-    grid = Grid.for_count(size, 3)._replace(margin=margin)
-    height, width = grid.rows + 2 * margin, grid.columns + 2 * margin
-    row, column = np.divmod(np.arange(height * width), width)
-    cell = np.stack([column, row], -1) - margin
-    inside, outside = grid.split(cell)
-    assert inside.tolist() == list(range(grid.rows * grid.columns))
-    assert outside.tolist() == list(range(grid.num_outside))
-    assert np.array_equal(grid.join(inside, outside), cell)
-
-
-def write_cells(size: tuple[int, int], count: int) -> tuple[bytes, list[tuple[int, Integers]]]:
-    """Write the cells of three classes of size, some outside; return the classes and their cells, too."""
-    generator, writer, coder, classes = np.random.default_rng(0), Writer(), OccupancyCoder(size), []
-    for class_of_size, share in ((2, 1.0), (1, 0.4), (2, 0.01)):
-        some = max(int(share * count), 1)
-        grid = Grid.for_count(size, some)
-        column, row = ((generator.random(some) ** 2 * (n + 1)).astype(int) for n in (grid.columns, grid.rows))
-        cell = np.stack([column, row], -1)
-        classes.append((class_of_size, cell[np.lexsort(cell.T)]))
-        coder.code(writer, class_of_size, classes[-1][1])
-    return writer.finish(), classes
-
-
-@pytest.mark.parametrize("size", [(1, 1), (1, 3000), (3000, 1), (3, 1000), (1024, 1024), (1, 1 << 17)])
-def test_cells_of_any_shape(size: tuple[int, int]) -> None:
-    data, classes = write_cells(size, min(40_000, size[0] * size[1]))
-    reader, decoder = Reader(data), OccupancyCoder(size)
-    for class_of_size, cell in classes:
-        assert np.array_equal(decoder.code(reader, class_of_size, 0 * cell), cell)

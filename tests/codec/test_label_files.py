@@ -1,8 +1,7 @@
-"""Label maps to bytes and back, and what the command line does with them."""
+"""Label maps to bytes and back."""
 
 from __future__ import annotations
 
-import json
 import zlib
 from pathlib import Path
 from typing import Any
@@ -12,13 +11,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import Image
-from torch import Tensor
 
-from kcgs.cli import main
 from kcgs.codec import decode_labels, encode_labels
 from kcgs.codec.labels import pixels
-from kcgs.data import load_labels, save_labels
+from kcgs.data import load_labels
 
 from .conftest import make_labels
 
@@ -34,7 +30,7 @@ def roundtrip(labels: Any) -> bytes:
 
 
 class TestEncodeLabels:
-    @settings(max_examples=40)
+    @settings(max_examples=20)
     @given(st.data())
     def test_roundtrip(self, data: st.DataObject) -> None:
         height, width = data.draw(st.integers(1, 24)), data.draw(st.integers(1, 24))
@@ -66,17 +62,12 @@ class TestEncodeLabels:
         roundtrip(np.random.default_rng(0).permutation(50 * 60).reshape(50, 60) * 400_000)
 
     @pytest.mark.parametrize(
-        ("labels", "max_bytes"),
-        [
-            (np.arange(1 << 16)[None] // 2 % 2, 60),
-            (np.zeros((480, 854), np.int64), 16),
-            (np.full((480, 854), 1 << 24), 20),
-        ],
+        ("labels", "max_bytes"), [(np.arange(1 << 16)[None] // 2 % 2, 60), (np.full((480, 854), 1 << 24), 20)]
     )
     def test_regular_maps_take_few_bytes(self, labels: Any, max_bytes: int) -> None:
         assert len(roundtrip(labels)) <= max_bytes
 
-    @pytest.mark.parametrize("regions", [2, 3, 16, 256])
+    @pytest.mark.parametrize("regions", [2, 256])
     def test_noise(self, regions: int) -> None:
         labels = np.random.default_rng(1).integers(0, regions, (96, 96))
         assert len(roundtrip(labels)) < 1.001 * labels.size * np.log2(regions) / 8 + 30 + regions
@@ -106,13 +97,7 @@ class TestEncodeLabels:
         assert (len(data), zlib.crc32(data)) == (103, 3363245403)
 
     @pytest.mark.parametrize(
-        ("pattern", "step", "share"),
-        [
-            ("DAVIS/Annotations/480p/*/00000.png", 18, 0.285),
-            ("bsds/*/mask.png", 6, 0.3),
-            pytest.param("DAVIS/Annotations/480p/*/00000.png", 1, 0.285, marks=pytest.mark.slow),
-            pytest.param("bsds/*/mask.png", 1, 0.3, marks=pytest.mark.slow),
-        ],
+        ("pattern", "step", "share"), [("DAVIS/Annotations/480p/*/00000.png", 18, 0.285), ("bsds/*/mask.png", 6, 0.3)]
     )
     def test_share_of_webp(self, data_root: Path, pattern: str, step: int, share: float) -> None:
         """Beside lossless WebP; the network was trained on other maps, of other images."""
@@ -125,10 +110,8 @@ class TestEncodeLabels:
     @pytest.mark.parametrize(
         ("labels", "error", "match"),
         [
-            (torch.full((3, 3), 0.5), ValueError, "labels must hold whole numbers; got 0.5"),
             ([[1]], TypeError, "a PIL image or a path; got list"),
             (torch.zeros(1, 3, 3).long(), ValueError, "labels must have 2 dimensions"),
-            (torch.zeros(0, 3).long(), ValueError, "labels must have at least one pixel"),
             (torch.tensor([[-1]]), ValueError, "labels must hold non-negative ids"),
             (np.full((3, 3), 1 << 63, np.uint64), ValueError, r"must hold ids below 2\*\*63; got 9223372036854775808"),
             (torch.zeros(1, (1 << 20) + 1, dtype=torch.uint8), ValueError, "pixels per side of labels must be in"),
@@ -137,72 +120,3 @@ class TestEncodeLabels:
     def test_wrong_labels(self, labels: Any, error: type[Exception], match: str) -> None:
         with pytest.raises(error, match=match):
             encode_labels(labels)
-
-
-class TestIdsAsColors:
-    @pytest.mark.parametrize(
-        ("path", "labels", "match"),
-        [
-            ("a.png", torch.tensor([[1 << 24]]), "must be at most 16777215; got 16777216"),
-            ("a.npy", torch.tensor([[1]]), "path must end in .png; got"),
-        ],
-    )
-    def test_wrong_arguments(self, path: str, labels: Tensor, match: str, tmp_path: Path) -> None:
-        with pytest.raises(ValueError, match=match):
-            save_labels(tmp_path / path, labels, rgb_ids=True)
-
-    def test_wrong_file(self, tmp_path: Path) -> None:
-        Image.fromarray(np.full((4, 4, 4), 9, np.uint8)).save(tmp_path / "a.png")
-        with pytest.raises(ValueError, match="must be RGB of 8 bits; got 4 channels of uint8"):
-            load_labels(tmp_path / "a.png", rgb_ids=True)
-
-
-class TestCommands:
-    @pytest.fixture
-    def run(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Any:
-        monkeypatch.chdir(tmp_path)
-
-        def run(*arguments: str, code: int = 0) -> str:
-            monkeypatch.setattr("sys.argv", ["kcgs", *arguments])
-            with pytest.raises(SystemExit) as exit_info:
-                main()
-            captured = capsys.readouterr()
-            assert (exit_info.value.code or 0) == code, captured.err
-            return captured.err if code else captured.out
-
-        return run
-
-    @pytest.mark.parametrize(
-        ("factor", "suffix", "mode"),
-        [(1, "png", "P"), (300, "png", "I;16"), (70_000, "png", "RGB"), (1 << 40, "npy", "")],
-    )
-    def test_roundtrip(self, run: Any, factor: int, suffix: str, mode: str) -> None:
-        labels = torch.from_numpy(make_labels(2)) * factor
-        save_labels(f"mask.{suffix}", labels, rgb_ids=mode == "RGB")
-        report = json.loads(run("encode", f"mask.{suffix}", "-o", "mask.kcgs", "--json"))
-        assert report["bytes"] == Path("mask.kcgs").stat().st_size < 400
-        assert (report["holds"], report["regions"], report["largest_id"]) == ("label map", 6, 5 * factor)
-        assert json.loads(run("info", "mask.kcgs", "--json")) == report and "label map" in run("info", "mask.kcgs")
-        Path("mask.kcgs").rename("mask.other")  # the suffix does not matter
-        run("decode", "mask.other", "-o", f"decoded.{suffix.upper()}")
-        assert torch.equal(load_labels(f"decoded.{suffix.upper()}", rgb_ids=True), labels)
-        if mode:
-            with Image.open("decoded.PNG") as image:
-                assert image.mode == mode
-
-    def test_wrong_use(self, run: Any) -> None:
-        save_labels("mask.png", torch.from_numpy(make_labels(2)))
-        run("encode", "mask.png", "-o", "mask.kcgs")
-        for command, code, message in (
-            ("encode mask.png -o b.kcgs --quality 40", 2, "'--quality': must be left out with a label map"),
-            ("decode mask.kcgs -o b.png --bytes 5", 2, "'--bytes': must be left out"),
-            ("decode mask.kcgs -o b.jpg", 2, ".png or .npy"),
-            ("encode mask.kcgs -o b.kcgs", 1, "kcgs decode writes it"),
-            ("render mask.kcgs -o b.png", 1, "it is a label map, no scene"),
-            ("encode none.png -o b.kcgs", 2, "No such file or directory: none.png"),
-        ):
-            assert message in run(*command.split(), code=code)
-        Path("mask.kcgs").write_bytes(Path("mask.kcgs").read_bytes()[:-1])
-        for command in ("info mask.kcgs", "decode mask.kcgs -o b.png"):
-            assert "the file is damaged" in run(*command.split(), code=1)
-        assert not Path("b.png").exists() and not Path("b.kcgs").exists()

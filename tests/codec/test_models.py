@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
-
 import numpy as np
-import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kcgs.codec.exact import cos_sin, exp2
-from kcgs.codec.gaussians.quantize import Parameters, Quantizer, opponent
+from kcgs.codec.gaussians.quantize import Parameters, Quantizer
 from kcgs.codec.labels.contexts import MAX_LOGIT, SQUASH
-from kcgs.codec.labels.ids import RankTree
 from kcgs.codec.rangecoder import Reader, Writer
 from kcgs.functional import region_splat
-
-from .conftest import make_scene
 
 
 class TestElementaryFunctions:
@@ -26,12 +20,6 @@ class TestElementaryFunctions:
         assert np.abs(exp2(x) / np.exp2(x) - 1).max() < 1e-15
         cos, sin = cos_sin(share)
         assert max(np.abs(cos - np.cos(np.pi * share)).max(), np.abs(sin - np.sin(np.pi * share)).max()) < 1e-15
-
-    def test_same_bits_on_all_machines(self) -> None:
-        x = np.linspace(-40, 40, 9973)
-        values = np.concatenate([exp2(x), *cos_sin((x + 40) / 80)])
-        digest = hashlib.sha256(values.astype("<f8").tobytes()).hexdigest()
-        assert digest == "b49209ad81f58afac91381f953cee7cf27fe602f2af2f2f935b2bab284e1643f"
 
     def test_squash_does_not_depend_on_the_last_digit_of_exp(self) -> None:
         exact = 65536 / (1 + np.exp(-np.arange(-MAX_LOGIT, MAX_LOGIT + 1) / 256))
@@ -52,53 +40,15 @@ class TestWriter:
         assert len(data) <= cost / 8 + 1.1
         assert np.array_equal(Reader(data).bits(chances, values), values)
 
-    @pytest.mark.parametrize("size", [1, 2, 1 << 16, (1 << 16) + 1, 3 << 20, 1 << 40])
-    def test_numbers_of_any_size(self, size: int) -> None:
-        """A number is its bits above the low 16, of which there may be many, then the low 16."""
-        numbers, writer = sorted({0, size // 3, size // 2, size - 1}), Writer()
-        assert [writer.number(number, size) for number in numbers] == numbers
-        reader = Reader(writer.finish())
-        assert [reader.number(0, size) for _ in numbers] == numbers
-
-
-class TestRankTree:
-    @pytest.mark.parametrize("count", [1, 2, 7, 8, 100])
-    def test_rank_and_remove(self, count: int) -> None:
-        generator, tree, remaining = np.random.default_rng(0), RankTree(count), list(range(count))
-        while remaining:
-            rank = int(generator.integers(len(remaining)))
-            assert tree.rank(remaining[rank]) == rank
-            assert tree.remove(rank) == remaining.pop(rank)
-
 
 class TestQuantizer:
-    @pytest.mark.parametrize("qp", [-100, 200, 600])
-    def test_within_half_a_step(self, qp: int) -> None:
-        field = make_scene(200, (96, 144), 1).field
-        numbers = (t.detach().double().numpy() for t in (field.means, field.cholesky, field.colors))
-        gaussians = means, cholesky, colors = Parameters(*numbers)
-        quantizer = Quantizer(qp, (96, 144))
-        classes = quantizer.classify(gaussians)
-        steps = quantizer.steps(classes)
-        restored = quantizer.dequantize(quantizer.quantize(gaussians, classes))
-        restored_means, shape, restored_colors = (t.astype(np.float64) for t in restored)
-        assert (np.abs(opponent(restored_colors - colors)) <= (0.5 + 1e-4) * steps.color[:, None] + 1e-6).all()
-        scale, original = (0.5 * np.log2(t[:, 0] * t[:, 2]) for t in (shape, cholesky))
-        assert (np.abs(scale - original) <= 0.75 * (0.5 + 1e-4) / steps.num_scales + 1e-6).all()
-        # a centre is within half a place across, and down across its slant
-        across, down = (steps.side[:, None] / steps.num_places(shape)).T
-        error = restored_means - means
-        slanted = error[:, 1] - shape[:, 1] / shape[:, 0] * error[:, 0]
-        assert (np.abs(error[:, 0]) <= (0.5 + 1e-4) * across + 1e-4).all()
-        assert (np.abs(slanted) <= (0.5 + 1e-4) * down + 1e-3).all()
-
     def test_distortion(self) -> None:
         """Each of the 8 numbers adds the distortion, where Gaussians are far apart and inside the image."""
         size, generator = (160, 160), np.random.default_rng(0)
         grid = np.stack(np.meshgrid(np.arange(4), np.arange(4)), -1).reshape(-1, 2)
         l11, l21, l22 = generator.uniform(2, 5, 16), generator.uniform(-2, 2, 16), generator.uniform(2, 5, 16)
         cholesky, colors = np.stack([l11, l21, l22], -1), generator.uniform(0.3, 1.0, (16, 3))
-        quantizer, total, rounds = Quantizer(200, size), 0.0, 16
+        quantizer, total, rounds = Quantizer(200, size), 0.0, 8
         for _ in range(rounds):
             means = 40.0 * grid + 20 + generator.uniform(-2, 2, (16, 2))
             gaussians = Parameters(means, cholesky, colors)

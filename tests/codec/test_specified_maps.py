@@ -249,58 +249,58 @@ def cells(height: int, width: int, regions: int, seed: int = 0, noise: float = 0
 def blobs(regions: int) -> Labels:
     """Discs on a ground, so that most labels come up inside others."""
     rng = np.random.RandomState(3)
-    y, x = np.mgrid[:60, :90]
-    labels = np.zeros((60, 90), np.int64)
+    y, x = np.mgrid[:45, :60]
+    labels = np.zeros((45, 60), np.int64)
     for region in range(1, regions):
-        labels[(y - rng.randint(60)) ** 2 + (x - rng.randint(90)) ** 2 < rng.randint(3, 12) ** 2] = region
+        labels[(y - rng.randint(45)) ** 2 + (x - rng.randint(60)) ** 2 < rng.randint(3, 12) ** 2] = region
     return labels
 
 
 def points(regions: int) -> Labels:
     """Single pixels, hundreds of them, each with one label neighbours it."""
     rng = np.random.RandomState(regions)
-    labels = np.zeros((60, 90), np.int64)
-    labels[1::3, 2::4] = rng.randint(1, regions, size=(20, 22)) * (rng.rand(20, 22) < 0.7)
+    labels = np.zeros((45, 60), np.int64)
+    labels[1::3, 2::4] = rng.randint(1, regions, size=(15, 15)) * (rng.rand(15, 15) < 0.7)
     return labels
 
 
 Y, X = np.mgrid[:40, :60]
-ROW = cells(1, 150, 5)
 CASES = {
     "one": np.full((5, 7), 2**40),
     "disc": ((Y - 20) ** 2 + (X - 30) ** 2 < 200) * 7,
     "stripes": X // 7 % 2,
     "noise": np.random.RandomState(1).randint(5, size=(20, 30)),
-    "cells": cells(60, 90, 14),
     "ids": shuffled(cells(40, 60, 14)),
     "speckled": shuffled(cells(24, 44, 9, noise=0.05)),
     "two, speckled": cells(24, 44, 2, noise=0.05),
     "points": points(2),
     "points of nine": points(9),
     "blobs": blobs(14),
-    "row": ROW,
-    "column": ROW.T,
+    "row": cells(1, 150, 5),
     # above row 0, 9 columns beyond the last pixel, lies label 0, nearer to it than any other
     "end of a row": np.repeat([0, 1, 2, 1], [200, 3, 25, 1])[None],
     # the place of its only start is a number of more than 65536
     "long row": np.eye(1, 66000, 65900),
     # what is above the map, and to its right, decides much here
-    **{f"low {seed}": cells(1 + seed % 4, 40, 9, seed, noise=0.02) for seed in range(4)},
+    **{f"low {seed}": cells(1 + seed % 4, 40, 9, seed, noise=0.02) for seed in (1, 3)},
 }
 
 
 @pytest.mark.parametrize("name", CASES)
-class TestLabels:
-    def test_in_a_scene(self, name: str) -> None:
-        check_map(RegionMap(torch.from_numpy(np.asarray(CASES[name], np.int64))))
-
-    def test_as_a_file(self, name: str) -> None:
-        labels = np.asarray(CASES[name], np.int64)
-        assert read_file(encode_labels(labels)) == ("int64", labels.tolist())
+def test_labels_of_a_scene(name: str) -> None:
+    check_map(RegionMap(torch.from_numpy(np.asarray(CASES[name], np.int64))))
 
 
-@pytest.mark.parametrize("ids", [[0, 255], [255, 0], [0, 1], [1, 0], [7, 9], [0, 3, 2, 1, 5], [9, 1, 200, 3, 254]])
-@pytest.mark.parametrize("kind", ["uint8", "int32"])
+@pytest.mark.parametrize("name", ["one", "disc", "noise", "ids", "two, speckled", "points of nine", "row"])
+def test_labels_of_a_file(name: str) -> None:
+    labels = np.asarray(CASES[name], np.int64)
+    assert read_file(encode_labels(labels)) == ("int64", labels.tolist())
+
+
+@pytest.mark.parametrize(
+    ("ids", "kind"),
+    [([0, 255], "uint8"), ([255, 0], "uint8"), ([0, 1], "int32"), ([7, 9], "int32"), ([9, 1, 200, 3, 254], "uint8")],
+)
 def test_ids_of_files(ids: list[int], kind: str) -> None:
     labels = np.array(ids, kind)[cells(20, 30, len(ids))]
     assert read_file(encode_labels(labels)) == (kind, labels.tolist())

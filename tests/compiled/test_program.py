@@ -6,7 +6,6 @@ import ast
 import errno
 import inspect
 import os
-import subprocess
 import sys
 from collections.abc import Callable
 from importlib import import_module
@@ -91,8 +90,6 @@ def replace_by_a_folder(file: Path) -> None:
     "damage",
     [
         pytest.param(lambda file: file.write_bytes(b""), id="empty"),
-        pytest.param(lambda file: file.write_bytes(file.read_bytes()[:1000]), id="truncated"),
-        pytest.param(lambda file: file.write_bytes(b"\n" * 1000), id="overwritten"),
         flip_a_bit,
         replace_by_a_folder,
     ],
@@ -120,33 +117,6 @@ def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pyte
     reason = "(No space left on device): what is compiled now is not kept"
     assert caplog.messages == [f"kcgs: cannot write into {tmp_path} {reason}"]
     assert not list(tmp_path.rglob("*.nb*"))
-
-
-def test_two_processes_compile_at_once(tmp_path: Path) -> None:
-    code = (
-        "import numpy as np\n"
-        "from scaling.loops import scale\n"
-        "print('ready', flush=True)\n"
-        "input()\n"
-        "print(scale(np.ones(1)))\n"
-    )
-    folder, cache = make_scaling(tmp_path / "folder", 2.0), tmp_path / "cache"
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
-    processes = [
-        subprocess.Popen(
-            [sys.executable, "-c", code], cwd=folder, env=environment, text=True,
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-        )
-        for _ in range(2)
-    ]  # fmt: skip
-    for process in processes:
-        assert process.stdout is not None and process.stdout.readline() == "ready\n"
-    for process in processes:
-        assert process.stdin is not None
-        process.stdin.write("\n")
-        process.stdin.flush()
-    assert [process.communicate()[0] for process in processes] == ["2.0\n", "2.0\n"]
-    assert len([path for path in cache.rglob("*") if path.is_file()]) == 1
 
 
 def test_constant_of_another_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

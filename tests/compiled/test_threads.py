@@ -20,7 +20,6 @@ from kcgs import GaussianField, Scene, load
 from kcgs.compiled import num_threads, threads_for_kernels
 from kcgs.compiled.program import Program
 from kcgs.compiled.tasks import first_task, next_task, phases, run_tasks
-from kcgs.editing import delete_region
 from kcgs.rate import compress
 from kcgs.segment import segment
 
@@ -57,9 +56,7 @@ class TestThreads:
     @pytest.mark.parametrize(
         ("name", "work"),
         [
-            ("kcgs.editing.fill.inpaint_from_matches", lambda: delete_region(scene(), 1)),
             ("kcgs.segment.cleanup.merge_small", lambda: segment(torch.rand(3, *SIZE), "felzenszwalb")),
-            ("kcgs.segment.methods.auto.clean", lambda: segment(torch.rand(3, *SIZE))),
             ("kcgs.rate.compress.psnr", lambda: compress(scene(), torch.rand(3, *SIZE), target_psnr=5.0)),
         ],
     )
@@ -110,11 +107,11 @@ class TestTasks:
             run_tasks(partial(count_too_early, done, early), tasks, work)
             assert done.all() and not early.any()
 
-    @pytest.mark.parametrize("failing", [0, 3, 7])
+    @pytest.mark.parametrize("failing", [0, 3])
     def test_failure_of_any_thread(self, failing: int) -> None:
         """The caller gets the exception, and no later phase begins."""
         tasks = phases(*(np.zeros((2, 1), np.int64) for _ in range(4)))
-        for _ in range(20):
+        for _ in range(5):
             done = np.zeros(len(tasks), np.bool_)
             with pytest.raises(ValueError, match="a task fails"):
                 run_tasks(partial(fail_at, failing, done), tasks)
@@ -148,7 +145,7 @@ scene = Scene(GaussianField.random(400, (48, 64), regions=labels, seed=0), label
 
 def work():
     threading.main_thread().join()
-    fit(torch.rand(3, 48, 64), labels, 40, iterations=20).scene.save(sys.argv[1])
+    fit(torch.rand(3, 48, 64), labels, 40, iterations=3).scene.save(sys.argv[1])
 
 atexit.register(lambda: print("at exit", tuple(scene.render().shape)))
 threading.Thread(target=work).start()

@@ -1,7 +1,5 @@
 """Label maps in colours."""
 
-from typing import Any
-
 import pytest
 import torch
 from skimage.color import rgb2lab
@@ -22,10 +20,9 @@ class TestLabelColors:
         lab = torch.from_numpy(rgb2lab(label_colors(12).numpy()))
         assert (torch.cdist(lab, lab) + 1000 * torch.eye(12)).min() > 15
 
-    @pytest.mark.parametrize(("n", "message"), [(1.0, "an integer"), (True, "an integer"), (-1, "at least 0; got -1")])
-    def test_bad_number(self, n: Any, message: str) -> None:
-        with pytest.raises((TypeError, ValueError), match=f"n must be {message}"):
-            label_colors(n)
+    def test_bad_number(self) -> None:
+        with pytest.raises(ValueError, match="n must be at least 0; got -1"):
+            label_colors(-1)
 
 
 class TestColorizeLabels:
@@ -33,10 +30,9 @@ class TestColorizeLabels:
         image = colorize_labels(torch.tensor([[0, 255, 10**12], [255, 255, 0]]))
         assert torch.equal(image, label_colors(3)[torch.tensor([[0, 1, 2], [1, 1, 0]])].permute(2, 0, 1))
 
-    @pytest.mark.parametrize("labels", [torch.full((2, 2), 0.5), torch.tensor([[-1]])])
-    def test_bad_labels(self, labels: torch.Tensor) -> None:
-        with pytest.raises((TypeError, ValueError), match="labels must"):
-            colorize_labels(labels)
+    def test_bad_labels(self) -> None:
+        with pytest.raises(ValueError, match="labels must hold non-negative ids"):
+            colorize_labels(torch.tensor([[-1]]))
 
 
 class TestOverlay:

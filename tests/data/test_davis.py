@@ -51,10 +51,9 @@ class TestDavis:
         with pytest.raises(FileNotFoundError, match=rf"{tree}.*cows.00000\.{suffix}"):
             davis["cows"]
 
-    @pytest.mark.parametrize("name", ["", "nowhere"])
-    def test_bad_root(self, tmp_path: Path, name: str) -> None:
+    def test_bad_root(self, tmp_path: Path) -> None:
         with pytest.raises(FileNotFoundError, match=r"root must hold JPEGImages.*Annotations"):
-            Davis(tmp_path / name)
+            Davis(tmp_path)
 
     def test_real_data(self, data_root: Path) -> None:
         if not (data_root / "DAVIS").is_dir():

@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 import tifffile
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from PIL import Image, ImageFile, ImageOps
 from torch import Tensor
 
@@ -92,15 +90,11 @@ EXACT, EIGHT_BITS, JPEG = 1e-6, 0.02, 0.05
 FILES: dict[str, tuple[bytes, str, Any, float]] = {
     "RGB": (pillow_bytes(RGB), "RGB", RGB / 255, EXACT),
     "RGB as L": (pillow_bytes(RGB), "L", RGB / 255 @ LUMA, EXACT),
-    "RGB as RGBA": (pillow_bytes(RGB), "RGBA", np.insert(RGB / 255, 3, 1, -1), EXACT),
     "RGBA": (pillow_bytes(RGBA), "RGBA", RGBA / 255, EXACT),
     "RGBA as RGB": (pillow_bytes(RGBA), "RGB", on_white(RGBA), EXACT),
-    "RGBA as L": (pillow_bytes(RGBA), "L", on_white(RGBA) @ LUMA, EXACT),
-    "grey": (pillow_bytes(GREY), "L", GREY / 255, EXACT),
     "grey as RGB": (pillow_bytes(GREY), "RGB", GREY.repeat(3, -1) / 255, EXACT),
     "one bit": (pillow_bytes(GREY > 127), "L", GREY > 127, EXACT),
     "grey and alpha": (pillow_bytes(GREY_ALPHA), "RGBA", GREY_ALPHA[..., [0, 0, 0, 1]] / 255, EXACT),
-    "grey and alpha as RGB": (pillow_bytes(GREY_ALPHA), "RGB", on_white(GREY_ALPHA).repeat(3, -1), EXACT),
     "palette": (pillow_bytes(PALETTE), "RGB", np.asarray(PALETTE.convert("RGB")) / 255, EXACT),
     "palette with transparency": (
         pillow_bytes(CLEAR_PALETTE, transparency=bytes([0, 51, 255])), "RGB", [[[1, 1, 1], [0.8, 1, 0.8], [0, 0, 1]]],
@@ -108,20 +102,16 @@ FILES: dict[str, tuple[bytes, str, Any, float]] = {
     ),
     "colour key": (png_bytes(RGB, [KEY]), "RGBA", np.concatenate([RGB / 255, KEY_ALPHA], -1), EXACT),
     "portable graymap": (GRAYMAP, "L", DEEP[1] / 65535, EXACT),
-    "CMYK TIFF": (pillow_bytes(Image.fromarray(CMYK_RED, mode="CMYK"), "TIFF"), "RGB", RED, EXACT),
     "CMYK JPEG": (pillow_bytes(Image.fromarray(CMYK_RED, mode="CMYK"), "JPEG", quality=100), "RGB", RED, EIGHT_BITS),
     "JPEG": (pillow_bytes(RAMP, "JPEG", quality=95), "RGB", RAMP / 255, JPEG),
     "WebP": (pillow_bytes(RAMP, "WEBP", quality=95), "RGB", RAMP / 255, JPEG),
     "TIFF with white as zero": (tiff_bytes(DEEP[1], photometric="miniswhite"), "L", 1 - DEEP[1] / 65535, EXACT),
     "float TIFF": (tiff_bytes(FLOATS), "RGB", FLOATS, 0),
-    "grey float TIFF": (tiff_bytes(FLOATS[..., :1]), "L", FLOATS[..., :1], 0),
 }  # fmt: skip
 for count, name in ((1, "L"), (3, "RGB"), (4, "RGBA")):  # 16 bits, to less than one of 65,535 levels
     FILES[f"16-bit PNG {name}"] = png_bytes(DEEP[count]), name, DEEP[count] / 65535, EXACT
-    for order in "<>":
-        for compression in (None, "zlib"):
-            data = tiff_bytes(DEEP[count], byteorder=order, compression=compression)
-            FILES[f"16-bit TIFF {name} {order} {compression}"] = data, name, DEEP[count] / 65535, EXACT
+    FILES[f"16-bit TIFF {name}"] = tiff_bytes(DEEP[count]), name, DEEP[count] / 65535, EXACT
+FILES["16-bit TIFF, big-endian"] = tiff_bytes(DEEP[3], byteorder=">", compression="zlib"), "RGB", DEEP[3] / 65535, EXACT
 WHOLE = {
     "png": pillow_bytes(np.tile(RGB, (4, 4, 1))),
     "jpg": pillow_bytes(np.tile(RGB, (4, 4, 1)), "JPEG"),
@@ -148,7 +138,7 @@ class TestLoadImage:
         assert image.dtype == torch.float32 and image.is_contiguous() and 0 <= image.min() <= image.max() <= 1
         np.testing.assert_allclose(pixels(image), np.reshape(expected, pixels(image).shape), atol=tolerance, rtol=0)
 
-    @pytest.mark.parametrize("kind", ["GIF", "TIFF", "WEBP", "PNG"])
+    @pytest.mark.parametrize("kind", ["GIF", "TIFF"])
     def test_first_frame(self, tmp_path: Path, kind: str) -> None:
         frames = [Image.new("RGB", (4, 3), color) for color in ("red", "lime", "blue")]
         data = pillow_bytes(frames[0], kind, save_all=True, append_images=frames[1:])
@@ -165,8 +155,9 @@ class TestLoadImage:
         ("kind", "orientation"),
         [
             *(("JPEG", k) for k in range(1, 9)),
-            *((kind, 6) for kind in ("PNG", "WEBP", "TIFF")),
-            *((f"16-bit {kind}", k) for kind in ("PNG", "TIFF") for k in (5, 8)),
+            ("TIFF", 6),
+            ("16-bit PNG", 8),
+            ("16-bit TIFF", 8),
         ],
     )
     def test_orientation(self, tmp_path: Path, kind: str, orientation: int) -> None:
@@ -190,9 +181,9 @@ class TestLoadImage:
     @pytest.mark.parametrize(
         ("data", "message"),
         [
-            *((data, r"cannot read .*a\.png") for data in (b"", b"this is text", b"\x89PNG\r\n\x1a\n", b"II*\0")),
-            *((bad_float(value), r"must be in \[0, 1\]; got") for value in (-0.5, 1.5)),
-            *((bad_float(value), "must be finite; got") for value in (float("nan"), float("inf"))),
+            *((data, r"cannot read .*a\.png") for data in (b"this is text", b"II*\0")),
+            (bad_float(1.5), r"must be in \[0, 1\]; got"),
+            (bad_float(float("nan")), "must be finite; got"),
             (tiff_bytes(np.ones((4, 4), np.uint32)), "uint32 samples have no stated white"),
             (tiff_bytes(np.ones((16, 16, 16), np.uint16), photometric="minisblack", volumetric=True, tile=(16, 16, 16)),
              "expected one image"),
@@ -219,27 +210,11 @@ class TestLoadImage:
         with pytest.raises(ValueError, match=message):
             load_image(write(tmp_path / "a", data))
 
-    @pytest.mark.parametrize("share", [0.3, 0.8])
     @pytest.mark.parametrize("kind", WHOLE)
-    def test_truncated(self, tmp_path: Path, kind: str, share: float) -> None:
-        path = write(tmp_path / f"a.{kind}", WHOLE[kind][: int(len(WHOLE[kind]) * share)])
+    def test_truncated(self, tmp_path: Path, kind: str) -> None:
+        path = write(tmp_path / f"a.{kind}", WHOLE[kind][: len(WHOLE[kind]) // 2])
         with pytest.raises(ValueError, match=r"cannot read .*a\."):
             load_image(path)
-
-    @pytest.mark.parametrize("kind", WHOLE)
-    @settings(max_examples=20)
-    @given(data=st.data())
-    def test_damaged_bytes_give_an_image_or_value_error(self, tmp_path: Path, kind: str, data: st.DataObject) -> None:
-        damaged = bytearray(WHOLE[kind])
-        for _ in range(data.draw(st.integers(1, 4))):
-            damaged[data.draw(st.integers(0, len(damaged) - 1))] = data.draw(st.integers(0, 255))
-        path = write(tmp_path / f"a.{kind}", bytes(damaged))
-        try:
-            image = load_image(path)
-        except ValueError as error:
-            assert str(path) in str(error)
-        else:
-            assert image.shape[0] == 3 and 0 <= image.min() <= image.max() <= 1
 
     def test_bad_arguments(self, tmp_path: Path) -> None:
         with pytest.raises(FileNotFoundError, match=r"nothing\.png"):
@@ -254,9 +229,9 @@ class TestSaveImage:
     @pytest.mark.parametrize(
         ("suffix", "samples", "channels"),
         [
-            *((suffix, RGBA, "RGBA") for suffix in (".png", ".webp", ".tif", ".tiff", ".PNG")),
-            *((suffix, GREY, "L") for suffix in (".png", ".webp", ".tif", ".bmp")),
-            *((suffix, RGB, "RGB") for suffix in (".png", ".webp", ".tif", ".bmp")),
+            *((suffix, RGBA, "RGBA") for suffix in (".png", ".webp", ".tif", ".PNG")),
+            (".png", GREY, "L"),
+            *((suffix, RGB, "RGB") for suffix in (".tiff", ".bmp")),
         ],
     )
     def test_round_trip(self, tmp_path: Path, suffix: str, samples: np.ndarray, channels: Any) -> None:
@@ -274,29 +249,23 @@ class TestSaveImage:
         save_image(tmp_path / f"a{suffix}", image)
         torch.testing.assert_close(load_image(tmp_path / f"a{suffix}"), image, atol=0.06, rtol=0)
 
-    @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+    @pytest.mark.parametrize("dtype", [torch.float16, torch.float64])
     def test_clips_and_rounds_half_up(self, tmp_path: Path, dtype: torch.dtype) -> None:
         values = torch.tensor([[[-3.0, 0.0, 0.5, 1.0, 7.0]]], dtype=dtype, requires_grad=True)
         save_image(tmp_path / "a.png", values)
         assert (load_image(tmp_path / "a.png", channels="L") * 255).round().tolist() == [[[0, 0, 128, 255, 255]]]
-
-    @pytest.mark.parametrize("image", [RGB, Image.fromarray(RGB), RGB / 255])
-    def test_arrays_and_pil_images(self, tmp_path: Path, image: Any) -> None:
-        save_image(tmp_path / "a.png", image)
-        np.testing.assert_allclose(pixels(load_image(tmp_path / "a.png")), RGB / 255, atol=EXACT)
 
     @pytest.mark.parametrize(
         ("name", "image", "error", "message"),
         [
             *(
                 ("a.png", torch.zeros(shape), ValueError, "image must (have|be one image|not be empty)")
-                for shape in ((2, 4, 4), (5, 4, 4), (4, 4), (2, 3, 4, 4), (3, 0, 4))
+                for shape in ((2, 4, 4), (2, 3, 4, 4), (3, 0, 4))
             ),
             ("a.png", torch.full((3, 4, 4), float("nan")), ValueError, "image must be finite"),
             ("a.png", torch.zeros(3, 4, 4, dtype=torch.uint8), TypeError, "image must"),
             ("a.png", np.zeros((4, 4, 3), int), TypeError, "image must"),
-            ("a.png", None, TypeError, "image must"),
-            *((name, RGB, ValueError, r"path must end in \.png.*got") for name in ("a", "a.xyz", "a.npy")),
+            *((name, RGB, ValueError, r"path must end in \.png.*got") for name in ("a", "a.npy")),
             *((name, torch.zeros(4, 4, 4), ValueError, "to hold alpha") for name in ("a.jpg", "a.bmp")),
             ("nowhere/a.png", RGB, FileNotFoundError, r"folder .*nowhere does not exist"),
         ],

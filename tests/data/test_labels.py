@@ -5,12 +5,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import skimage.data
 import tifffile
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 from PIL import Image
 
 from kcgs.data import load_labels, save_labels
@@ -47,16 +43,15 @@ class TestLoadLabels:
             ("a.png", MAP, {"palette": [9, 9, 9] * 6}, MAP),
             ("a.png", MAP, {"palette": list(range(18)), "bits": 4, "transparency": 0}, MAP),
             ("a.png", (MAP > 2).astype(np.uint8) * 255, {}, (MAP > 2) * 255),
-            ("a.png", MAP > 2, {}, MAP > 2),
             ("a.png", MAP.astype(np.uint16) * 9000, {}, MAP.astype(int) * 9000),
             ("a.tif", MAP.astype(np.uint16) * 9000, {}, MAP.astype(int) * 9000),
-            *(("a.tiff", MAP.astype(dtype), {}, MAP) for dtype in (np.int32, np.uint32, np.int16, np.int8)),
+            ("a.tiff", MAP.astype(np.int32), {}, MAP),
             ("a.gif", LARGE, {"palette": PALETTE, "optimize": False}, LARGE),
-            *((f"a.{suffix}", LARGE, {"palette": PALETTE}, LARGE) for suffix in ("bmp", "tif")),
+            ("a.bmp", LARGE, {"palette": PALETTE}, LARGE),
             ("a.png", COLORS, {}, [[2, 0], [1, 0]]),
             ("a.png", CLEAR_COLORS, {}, [[0, 0, 2, 1]]),
             ("a.png", MANY_COLORS[:, :4096], {}, [range(4096)]),
-            *(("a.npy", MAP.astype(dtype), {}, MAP) for dtype in (np.uint8, np.int64, np.uint64, np.int16, ">i4")),
+            *(("a.npy", MAP.astype(dtype), {}, MAP) for dtype in (np.uint64, ">i4")),
             ("a.npy", MAP > 2, {}, MAP > 2),
         ],
     )
@@ -70,16 +65,11 @@ class TestLoadLabels:
     @pytest.mark.parametrize(
         ("name", "samples", "options", "message"),
         [
-            ("a.png", skimage.data.astronaut(), {}, r"at most 4096 distinct colours; got \d+ in .*a\.png"),
-            ("a.png", MANY_COLORS, {}, "got 4097"),
-            ("a.jpg", COLORS, {}, r"must be a label map in a lossless format .* got"),
-            ("a.webp", COLORS, {"quality": 90}, r"must be a label map in a lossless format .* got"),
+            ("a.png", MANY_COLORS, {}, r"at most 4096 distinct colours; got 4097 in .*a\.png"),
+            ("a.png", COLORS, {"format": "JPEG"}, r"must be a label map in a lossless format .* got JPEG"),
             ("a.tif", COLORS, {"compression": "jpeg"}, r"must be a label map in a lossless format .* got"),
-            ("a.png", COLORS, {"format": "JPEG"}, r"must be a label map in a lossless format .* got"),
             ("a.tiff", MAP.astype(np.float32), {}, r"a\.tiff must have an integer dtype; got float32"),
             ("a.tiff", MAP.astype(np.int16) - 1, {}, r"a\.tiff must hold non-negative ids; got -1"),
-            ("a.npy", MAP.astype(float), {}, "must have an integer dtype; got float64"),
-            ("a.npy", MAP.astype(np.int8) - 1, {}, "must hold non-negative ids; got -1"),
             ("a.npy", np.full((2, 2), 2**63, np.uint64), {}, r"must hold ids below 2\*\*63"),
             ("a.npy", MAP[None], {}, r"must have 2 dimensions; got shape \(1, 2, 4\)"),
             ("a.npy", np.zeros((0, 3), int), {}, r"must have at least one pixel; got shape \(0, 3\)"),
@@ -104,24 +94,11 @@ class TestLoadLabels:
 
 
 class TestSaveLabels:
-    @settings(max_examples=40)
-    @given(
-        values=st.sampled_from([(".png", 255), (".png", 65535), (".npy", 2**62)]).flatmap(
-            lambda kind: st.tuples(
-                st.just(kind[0]),
-                hnp.arrays(np.int64, hnp.array_shapes(min_dims=2, max_dims=2), elements=st.integers(0, kind[1])),
-            )
-        )
-    )
-    def test_round_trip(self, tmp_path: Path, values: tuple[str, np.ndarray]) -> None:
-        suffix, labels = values[0], torch.from_numpy(values[1])
+    @pytest.mark.parametrize(("suffix", "highest"), [(".png", 255), (".png", 65535), (".npy", 1 << 62)])
+    def test_round_trip(self, tmp_path: Path, suffix: str, highest: int) -> None:
+        labels = torch.tensor([[0, 3, highest], [3, 0, 9]])
         save_labels(tmp_path / f"a{suffix}", labels)
         assert torch.equal(load_labels(tmp_path / f"a{suffix}"), labels)
-
-    @pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.int32, torch.int64])
-    def test_integer_types(self, tmp_path: Path, dtype: torch.dtype) -> None:
-        save_labels(tmp_path / "a.png", torch.from_numpy(MAP).to(dtype))
-        np.testing.assert_array_equal(load_labels(tmp_path / "a.png"), MAP)
 
     def test_kinds_of_png(self, tmp_path: Path) -> None:
         save_labels(tmp_path / "a.png", torch.tensor([[0, 1, 255]]))
@@ -135,16 +112,11 @@ class TestSaveLabels:
         ("name", "labels", "error", "message"),
         [
             ("a.png", torch.tensor([[65536]]), ValueError, r"labels for a \.png must be at most 65535; got 65536"),
-            *(
-                (n, torch.from_numpy(MAP), ValueError, r"must end in \.png or \.npy; got")
-                for n in ("a", "a.jpg", "a.tif")
-            ),
-            *(
-                ("a.png", wrong, ValueError, "labels must hold whole numbers; got 0.5")
-                for wrong in (MAP + 0.5, torch.full((2, 2), 0.5))
-            ),
+            ("a.tif", torch.from_numpy(MAP), ValueError, r"must end in \.png or \.npy; got"),
+            ("a.png", MAP + 0.5, ValueError, "labels must hold whole numbers; got 0.5"),
+            ("a.png", torch.full((2, 2), 0.5), ValueError, "labels must hold whole numbers; got 0.5"),
             ("a.png", None, TypeError, "labels must"),
-            *(("a.png", torch.zeros(s).long(), ValueError, "labels must have") for s in ((4,), (1, 2, 2), (0, 2))),
+            *(("a.png", torch.zeros(s).long(), ValueError, "labels must have") for s in ((1, 2, 2), (0, 2))),
             ("a.npy", torch.tensor([[-2]]), ValueError, "labels must hold non-negative ids; got -2"),
             *((f"no/{n}", torch.from_numpy(MAP), FileNotFoundError, "no does not exist") for n in ("a.png", "a.npy")),
         ],
@@ -153,3 +125,18 @@ class TestSaveLabels:
         with pytest.raises(error, match=message):
             save_labels(tmp_path / name, labels)
         assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "highest", "message"),
+    [("a.png", 1 << 24, "must be at most 16777215; got 16777216"), ("a.npy", 1, "path must end in .png; got")],
+)
+def test_ids_that_no_colour_can_be(tmp_path: Path, name: str, highest: int, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        save_labels(tmp_path / name, torch.tensor([[highest]]), rgb_ids=True)
+
+
+def test_colours_that_are_no_ids(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.png", np.full((4, 4, 4), 9, np.uint8))
+    with pytest.raises(ValueError, match="must be RGB of 8 bits; got 4 channels of uint8"):
+        load_labels(path, rgb_ids=True)

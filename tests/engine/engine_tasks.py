@@ -7,8 +7,6 @@ import signal
 from pathlib import Path
 from typing import NamedTuple
 
-import torch
-
 
 class Task(NamedTuple):
     number: int
@@ -17,6 +15,8 @@ class Task(NamedTuple):
 
 def double(task: Task) -> tuple[int, int, int]:
     """Return a result, the process and its threads."""
+    import torch
+
     return 2 * task.number, os.getpid(), torch.get_num_threads()
 
 
@@ -33,14 +33,16 @@ def die_at_one(task: Task) -> int:
     return task.number
 
 
-def fit_image(task: Task) -> tuple[int, bytes]:
-    """Return the number of threads and the file of a fit, whose kernels run on all of them."""
+def fit_zero(task: Task) -> tuple[int, bytes]:
+    """Return the number of threads and the file of a fit, whose kernels run on all of them; job 1 fails."""
+    fail_at_one(task)
+    import torch
+
     from kcgs import fit, save
 
     ramp = torch.linspace(0.0, 1.0, 96)
     image = torch.stack([ramp.expand(64, 96), (8 * ramp).sin().square().expand(64, 96), ramp.flip(0).expand(64, 96)])
-    labels = (ramp > 0.3 + 0.1 * task.number).long().expand(64, 96).contiguous()
-    scene = fit(image, labels, 40, iterations=10, seed=task.number).scene
-    path = task.folder / f"{os.getpid()}-{task.number}.safetensors"
-    save(path, scene)
+    labels = (ramp > 0.3).long().expand(64, 96).contiguous()
+    path = task.folder / f"{os.getpid()}.safetensors"
+    save(path, fit(image, labels, 40, iterations=10).scene)
     return torch.get_num_threads(), path.read_bytes()

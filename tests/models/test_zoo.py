@@ -5,17 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
-import onnxruntime
 import pytest
-import torch
 
 import kcgs
 from benchmarks.core import images
 from benchmarks.core.run import Options
 from benchmarks.zoo import PLANS, make_zoo
 from kcgs.functional import psnr
-from kcgs.onnx import scene_decoder
 from kcgs.zoo import Entry, entries, find
 
 MODELS = Path(kcgs.__file__).resolve().parent.parent / "models"
@@ -41,12 +37,6 @@ def test_entry(entry: Entry) -> None:
     assert float(psnr(scene.render(), image)) == pytest.approx(entry.psnr, abs=0.02)
     folder = path.parent
     assert entry.licence in (folder / "card.md").read_text() and (folder / "preview.jpg").is_file()
-    model = scene_decoder(scene)
-    session = onnxruntime.InferenceSession(model.SerializeToString())
-    for factor in (1, 2):
-        size = (factor * image.shape[1], factor * image.shape[2])
-        (rendered,) = session.run(None, {"size": np.array(size)})
-        assert (torch.from_numpy(rendered)[0] - scene.render(size)).abs().max() < 1e-3
 
 
 class TestErrors:
@@ -58,7 +48,7 @@ class TestErrors:
         with pytest.raises(ValueError, match="zoo entry must be one of chart-2x3"):
             find("zoo:nothing")
 
-    @pytest.mark.parametrize("text", ["{", '{"entries": [{}]}', '{"entries": [3]}', "[]"])
+    @pytest.mark.parametrize("text", ["{", '{"entries": [{}]}', "[]"])
     def test_damaged_manifest(self, tmp_path: Path, text: str) -> None:
         (tmp_path / "manifest.json").write_text(text)
         with pytest.raises(ValueError, match="must be a zoo's manifest"):
