@@ -120,12 +120,9 @@ def assert_close(got: list[Tensor], want: list[Tensor], tolerance: float) -> Non
 @pytest.mark.parametrize(
     ("size", "batch", "maps", "softness"),
     [
-        ((110, 150), 1, 0, 0.0),
         ((110, 150), 2, 2, 0.7),
-        ((33, 17), 2, 1, 0.7),
         ((33, 17), 1, 1, 0.0),
         ((5, 70), 2, 0, 0.0),
-        ((5, 70), 2, 2, 0.7),
         ((9, 8), 2, 1, 0.7),
     ],
 )
