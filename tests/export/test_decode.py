@@ -133,9 +133,13 @@ def library_levels(folder: Path, field: GaussianField, regions: RegionMap | None
 
 
 class TestSceneDecoders:
-    @pytest.mark.parametrize("name", ["plain", "interactive"])
     @pytest.mark.parametrize(
-        ("options", "size"), [([], (10, 12)), (["--scale", 2.5], (25, 30)), (["--size", "7x1"], (1, 7))]
+        ("name", "options", "size"),
+        [
+            ("plain", [], (10, 12)),
+            ("interactive", ["--scale", 2.5], (25, 30)),
+            ("interactive", ["--size", "7x1"], (1, 7)),
+        ],
     )
     def test_sizes(
         self, files: Files, decode: Any, tmp_path: Path, name: str, options: list[object], size: tuple[int, int]
@@ -150,9 +154,8 @@ class TestSceneDecoders:
         assert decode(files.interactive, "-o", output, *options).code == 0
         np.testing.assert_allclose(np.load(output), ramp((15, 12), (-2, 1.5, 4, 9), blue=1), rtol=1e-5)
 
-    @pytest.mark.parametrize("softness", [0.0, 0.7])
-    def test_a_scene_of_the_library(self, decode: Any, tmp_path: Path, softness: float) -> None:
-        field, regions = make_field(), RegionMap(make_labels(), softness)
+    def test_a_scene_of_the_library(self, decode: Any, tmp_path: Path) -> None:
+        field, regions = make_field(), RegionMap(make_labels(), 0.7)
         decoder, output = tmp_path / "decoder.onnx", tmp_path / "out.png"
         onnx.save(scene_decoder(Scene(field, regions), clamp=False, interactive=True), decoder)
         assert decode(decoder, "-o", output, "--scale", 2) == Result(0, "", "")
@@ -229,34 +232,38 @@ class TestRefusals:
         ("arguments", "pattern"),
         [
             (["--scale", "0"], "argument --scale: must be a positive number; got '0'"),
-            (["--scale", "nan"], "--scale: must be a positive number; got 'nan'"),
             (["--scale", "two"], "--scale: must be a positive number; got 'two'"),
             (["--size", "640"], "--size: must be WxH, such as 640x480; got '640'"),
-            (["--size", "5x5", "--scale", "2"], "not allowed with"),
             (["--view", "0,0,5,nan"], "--view: must be LEFT,TOP,RIGHT,BOTTOM in pixels of the scene; got '0,0,5,nan'"),
             (["--view", "5,0,5,5"], "--view: must have LEFT < RIGHT and TOP < BOTTOM"),
             (["--view", "0,0,5,1e9"], "--view: must have LEFT < RIGHT and TOP < BOTTOM, up to 1048576"),
-            (["--region", "x"], "--region: invalid int value: 'x'"),
             (["--threads", "0"], "--threads: must be a whole number from 1 to 999999; got '0'"),
-            (["--repeat", "1.5"], "--repeat: must be a whole number from 1 to 999999; got '1.5'"),
-            (["--what"], "unrecognized arguments: --what"),
         ],
     )
     def test_usage(self, files: Files, refuses: Any, arguments: list[str], pattern: str) -> None:
         refuses(pattern, files.plain, *arguments, code=2)
 
-    @pytest.mark.parametrize("options", [["--size", "2000000x3"], ["--size", "0x3"], ["--scale", "1e300"]])
+    @pytest.mark.parametrize("options", [["--size", "0x3"], ["--scale", "1e300"]])
     def test_absurd_sizes(self, files: Files, refuses: Any, options: list[str]) -> None:
         refuses(r"the image must have 1 to 1048576 pixels a side; got \d+x\d+$", files.plain, *options)
 
-    @pytest.mark.parametrize("error", [MemoryError(), MemoryError("Unable to allocate 8 TiB"), KeyboardInterrupt()])
-    def test_stopped(self, files: Files, refuses: Any, monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
+    @pytest.mark.parametrize(
+        ("error", "words", "code"), [(MemoryError, "not enough memory", 1), (KeyboardInterrupt, "nothing written", 130)]
+    )
+    def test_stopped(
+        self,
+        files: Files,
+        refuses: Any,
+        monkeypatch: pytest.MonkeyPatch,
+        error: type[BaseException],
+        words: str,
+        code: int,
+    ) -> None:
         def stop(*_: object) -> None:
             raise error
 
         monkeypatch.setattr(SCRIPT_MODULE, "encode_png", stop)
-        interrupted = isinstance(error, KeyboardInterrupt)
-        refuses("nothing written" if interrupted else "memory|allocate", files.plain, code=130 if interrupted else 1)
+        refuses(words, files.plain, code=code)
 
     def test_outputs(self, files: Files, refuses: Any, tmp_path: Path) -> None:
         refuses(r"-o must end in .png or .npy; got .*out.jpg", files.plain, output=tmp_path / "out.jpg")
@@ -291,13 +298,7 @@ class TestRefusals:
         refuses(r"cannot read .*absent.onnx: No such file or directory", tmp_path / "absent.onnx")
         refuses(r"cannot read .*: Is a directory", tmp_path)
 
-    @pytest.mark.parametrize("content", [b"", b"\x89PNG\r\n\x1a\n" + bytes(100), b"\x80\x04}q\0.", b"\xff" * 64])
-    def test_foreign_files(self, refuses: Any, tmp_path: Path, content: bytes) -> None:
-        path = tmp_path / "foreign"
-        path.write_bytes(content)
-        refuses(f"onnxruntime cannot load {path}: ", path)
-
-    @pytest.mark.parametrize("text", [b"kcgs.decoder", b"format", b"visible", b"image"])
+    @pytest.mark.parametrize("text", [b"kcgs.decoder", b"visible"])
     def test_damaged_texts(self, files: Files, refuses: Any, tmp_path: Path, text: bytes) -> None:
         content, path = files.interactive.read_bytes(), tmp_path / "damaged.onnx"
         assert text in content
@@ -317,9 +318,7 @@ class TestRefusals:
         [
             (_edit(format=None), "is not a decoder: format must be kcgs.decoder; got None"),
             (_edit(format_version="2"), "is not a decoder: format_version must be 1; got '2'"),
-            (_edit(height=None), "its height must be a whole number of 1 to 1048576 pixels; got ''"),
             (_edit(width="1e3"), "its width must be a whole number of 1 to 1048576 pixels; got '1e3'"),
-            (_edit(region_ids="[1"), "is damaged: its region_ids must be a JSON list of integers"),
             (_edit(region_ids='{"a": 1}'), "is damaged: its region_ids must be a JSON list of integers"),
             (_edit(region_ids="[7, 9, 11]"), "failed at 12x10: .*visible"),
             (_rename_input, "is not a decoder: its inputs must be .*; got"),

@@ -103,22 +103,6 @@ class TestCases:
         for name in NAMES:
             assert sum((FOLDER / f"{name}{suffix}").stat().st_size for suffix in (".npz", ".onnx")) < 90_000
 
-    def test_cover_what_they_are_for(self, name: str, case: Arrays) -> None:
-        size, enlarged, reduced = wholes(case)
-        assert size == size_of(case) and enlarged > size > reduced
-        images = [array for key, array in case.items() if key.startswith("image_")]
-        assert len(images) == (4 if name == "plain" else 5)
-        for image in images:
-            assert image.dtype == np.float32 and image.std() > 0.03
-        if name != "plain":
-            assert set(case["visible"]) == {0, 1}
-            assert np.abs(case["image_visible"] - case[f"image_{size[0]}x{size[1]}"]).max() > 0.1
-        if name == "pairs":
-            assert 0 in case["softness"][:, 2] and len(set(case["softness"][:, 2])) > 3
-        if name == "needle":
-            assert case["colors"].shape[1] == 4
-            assert (case["cholesky"][:, 0] > 50 * case["cholesky"][:, 2]).any()
-
     def test_made_again_they_are_the_same(self, tmp_path: Path) -> None:
         load_maker().make(tmp_path)
         for name in NAMES:
