@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing.dummy
 import re
 import shutil
 from pathlib import Path
@@ -60,9 +61,10 @@ def test_no_gpu(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
 
 
 @pytest.mark.parametrize("name", OF_A_GPU)
-def test_a_cpu_in_place_of_a_gpu(name: str, tmp_path: Path) -> None:
-    """All but captures and counts of kernels, which need CUDA."""
+def test_a_cpu_in_place_of_a_gpu(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All but captures, counts of kernels and new processes, which need CUDA or seconds."""
     module, rows = module_of(name), []
+    monkeypatch.setattr(module, "get_context", lambda _: multiprocessing.dummy, raising=False)
     for job in module.jobs(Options(tmp_path, quick=True)):
         if job.get("task") not in ("captured", "kernels"):
             arguments = {**job, "device": "cpu", **({"method": "cpu"} if name == "gpu" else {})}

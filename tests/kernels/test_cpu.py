@@ -123,12 +123,12 @@ def one_pass():
     squared_error_gradients(image, *tables, field.region_ids, regions, cutoff=1e-4, backend="cpu")
 
 for call in (forward, both, one_pass):
-    for _ in range(10):
+    for _ in range(5):
         call()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    for _ in range(20):
+    for _ in range(10):
         call()
-    print(call.__name__, (resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before) / 20, flush=True)
+    print(call.__name__, (resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before) / 10, flush=True)
 
 pid = os.fork()
 forward()
