@@ -12,7 +12,6 @@ from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
-from unittest.mock import Mock
 
 import numpy as np
 import onnx
@@ -155,7 +154,11 @@ class TestRefusals:
         refuses(r"the image must have 1 to 1048576 pixels a side; got \d+x\d+$", plain, *options)
 
     def test_stopped(self, plain: Path, refuses: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-        stop = Mock(side_effect=[MemoryError, KeyboardInterrupt])
+        errors = iter([MemoryError, KeyboardInterrupt])
+
+        def stop(*_: object) -> None:
+            raise next(errors)
+
         monkeypatch.setattr(SCRIPT_MODULE, "encode_png", stop)
         refuses("not enough memory for this image", plain)
         refuses("interrupted, nothing written", plain, code=130)
