@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
@@ -260,38 +259,6 @@ def test_operator() -> None:
     gradients, expected = (backward(grad, *inputs.gaussians, *settings, name, True) for name in ("cuda", "reference"))
     for a, b in zip(gradients, expected, strict=True):
         assert b.any() and (a - b).abs().max() <= 1e-5 * b.abs().max()
-
-
-@pytest.mark.skipif(GPU, reason="there a profiler counts the steps of copies, too")
-def test_number_of_launches(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A forward takes at most 6 launches and 12 operations of torch, a backward 3 and 8; launches do nothing here."""
-    launches: list[str] = []
-
-    def launch(name: str) -> Callable[..., None]:
-        return lambda *arguments, **constants: launches.append(name)
-
-    def count(action: Callable[[], Any]) -> tuple[Any, int, int]:
-        launches.clear()
-        with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU], acc_events=True) as profile:
-            result = action()
-        operations = [e for e in profile.events() if e.name.startswith("aten::")]
-        return result, len(launches), len(operations)
-
-    arguments = small_splat()
-    leaves = [arguments[name].requires_grad_() for name in ("means", "cholesky", "colors")]
-    region_splat(**arguments)
-    for module, names in (
-        (plan, ("_prepare", "_bin", "_tile")),
-        (render, ("_render",)),
-        (gather, ("_gather", "_reduce")),
-    ):
-        for name in names:
-            monkeypatch.setattr(module, name, launch(name))
-    image, programs, operations = count(lambda: region_splat(**arguments))
-    assert programs <= 6 and operations <= 12
-    grad = torch.ones_like(image)
-    _, programs, operations = count(lambda: torch.autograd.grad(image, leaves, grad))
-    assert programs <= 3 and operations <= 8
 
 
 # CUDA graphs

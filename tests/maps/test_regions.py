@@ -53,9 +53,8 @@ class TestRegionMap(
 
     def test_feature(self, device: torch.device) -> None:
         """Ids need not be consecutive."""
-        regions = RegionMap(torch.tensor([[255, 0], [7, 100_000]], device=device))
-        assert regions.ids.tolist() == [0, 7, 255, 100_000]
-        assert regions.num_regions == 4
+        regions = RegionMap.from_labels(torch.tensor([[255, 0], [7, 100_000]], device=device), 0.7)
+        assert regions.ids.tolist() == [0, 7, 255, 100_000] and regions.softness == 0.7
         assert regions.index_of(torch.tensor([7, 8, 100_000, 0], device=device)).tolist() == [1, -1, 3, 0]
 
     @pytest.mark.parametrize(
@@ -76,20 +75,12 @@ class TestRegionMap(
         with pytest.raises(error, match=words):
             RegionMap(labels, softness)
 
-    def test_constructor(self) -> None:
-        regions, other = RegionMap(blobs(), 0.7), RegionMap.from_labels(blobs(), 0.7)
-        assert regions.softness == other.softness and torch.equal(regions.labels, other.labels)
-        assert regions.device == torch.device("cpu") and RegionMap(labels=blobs()).softness == 0.0
-
-    @pytest.mark.parametrize(
-        ("kind", "dtype"), [(torch.Tensor, torch.float16), (np.ndarray, torch.float32)]
-    )
-    def test_labels_of_augmentations(self, kind: type, dtype: torch.dtype) -> None:
+    def test_labels_of_augmentations(self) -> None:
         """Kornia returns masks as floating (B, 1, H, W); a map is the same, and all else that takes labels."""
         labels = torch.stack([blobs(seed=k) for k in (0, 1)])
-        mask = labels[:, None].to(dtype)
-        regions = RegionMap(mask if kind is torch.Tensor else mask.numpy())
-        assert torch.equal(regions.labels, labels)
+        mask = labels[:, None].half()
+        for given in (mask, mask.float().numpy()):
+            assert torch.equal(RegionMap(given).labels, labels)
         assert torch.equal(edge_band(mask), edge_band(labels))
         field = GaussianField.random(20, (45, 70), regions=labels[0], seed=0)
         tensors = [t.detach().expand(2, *t.shape) for t in (field.means, field.cholesky, field.colors)]
@@ -155,7 +146,6 @@ class TestPairSoftness:
         labels = torch.tensor([[3, 5, 9]])
         assert RegionMap(labels, {(3, 5): 0.7, (9, 3): 0.7, (5, 9): 0.7}).softness == 0.7
         assert RegionMap(labels, {(3, 5): 0.0}).softness == 0.0
-        assert RegionMap(labels, {}).softness == 0.0
         assert RegionMap(torch.ones(2, 2).long(), {}).softness == 0.0
 
     def test_merged_regions_have_the_mean_along_their_contours(self) -> None:

@@ -43,18 +43,19 @@ class TestEveryMethod:
         assert_segmentation(result, size)
         assert torch.equal(image, before) and torch.equal(result.labels, segment(image.double(), method))
 
-    def test_a_batch_is_its_images(self, method: str) -> None:
-        images = torch.rand(2, 3, 17, 31, generator=torch.Generator().manual_seed(0))
-        labels = segment(images, method, max_regions=3)
-        assert torch.equal(labels, torch.stack([segment(image, method, max_regions=3) for image in images]))
-        assert torch.equal(segment(images[:1], method, max_regions=3), labels[:1])
-
     def test_photo_and_options(self, method: str) -> None:
         image = photo("coffee", 4)
         result = segment_with_scores(image, method, min_size=500, max_regions=3)
         areas = result.labels.flatten().bincount()
         assert_segmentation(result, (100, 150))
         assert len(areas) <= 3 and areas.min() >= 500
+
+
+def test_a_batch_is_its_images() -> None:
+    images = torch.rand(2, 3, 17, 31, generator=torch.Generator().manual_seed(0))
+    labels = segment(images, "slic", max_regions=3)
+    assert torch.equal(labels, torch.stack([segment(image, "slic", max_regions=3) for image in images]))
+    assert torch.equal(segment(images[:1], "slic", max_regions=3), labels[:1])
 
 
 @pytest.mark.parametrize(
