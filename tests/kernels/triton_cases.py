@@ -96,10 +96,6 @@ def assert_close(got: list[Tensor], want: list[Tensor], tolerance: float) -> Non
         assert cosine >= 1 - tolerance
 
 
-def assert_matches_reference(inputs: SplatInputs, tolerance: float = 5e-6) -> None:
-    assert_close(evaluate(cuda, inputs), evaluate(reference, to_double(inputs)), tolerance)
-
-
 # no map, hard and soft contours; one map and one for each image; one channel, a block, more than a block
 @pytest.mark.parametrize(
     "case",
@@ -114,7 +110,8 @@ def assert_matches_reference(inputs: SplatInputs, tolerance: float = 5e-6) -> No
     ids=str,
 )
 def test_agrees_with_the_reference(case: dict[str, Any]) -> None:
-    assert_matches_reference(make_inputs(**case))
+    inputs = make_inputs(**case)
+    assert_close(evaluate(cuda, inputs), evaluate(reference, to_double(inputs)), 5e-6)
 
 
 def test_error() -> None:
