@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import time
@@ -16,7 +15,6 @@ from torch import Tensor
 from benchmarks.core.clocks import milliseconds, peak_megabytes, threads
 from benchmarks.core.codecs import available_codecs, decode_file, largest_file
 from benchmarks.core.compare import Comparison, Gain, differences
-from benchmarks.core.fits import QUICK_ITERATIONS, plan
 from benchmarks.core.images import load, load_mapped, names
 from benchmarks.core.run import Job, Options, Page, Row, read_rows, run_experiment, write_rows
 from benchmarks.core.scenes import fits_in, scene_of, size_of
@@ -147,14 +145,6 @@ class TestImages:
             image, labels = load(name, str(data_root))
             assert (labels is not None) == (group == "davis") and image.shape[0] == 3
 
-    def test_plan(self) -> None:
-        methods: Any = {"best": ("best", {}), "paper": ("paper", {"clamp": True})}
-        jobs = plan(["a"], (5, 6), methods, Options(Path()))
-        assert [job["n"] for job in jobs] == [5, 5, 6, 6]
-        assert jobs[0]["settings"] == {} and jobs[1]["settings"] == {"clamp": True}
-        quick = plan(["a"], (5,), methods, Options(Path(), quick=True))
-        assert {job["settings"]["iterations"] for job in quick} == {QUICK_ITERATIONS}
-
 
 class TestCodecs:
     @pytest.mark.parametrize("codec", available_codecs())
@@ -168,14 +158,12 @@ class TestCodecs:
 
     @pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # of pycocotools
     @pytest.mark.parametrize("codec", CODECS)
-    @pytest.mark.parametrize("most", [5, 400, 70_000])
+    @pytest.mark.parametrize("most", [5, 400])
     def test_label_maps(self, codec: str, most: int) -> None:
         pytest.importorskip(CODECS[codec].package, reason="needs pip install 'kcgs[bench]'")
         if codec == "RLE" and most > 5:
             pytest.skip("a mask for each region")
-        if codec in ("PNG", "JPEG XL") and most > 65_535:
-            pytest.skip("16 bits hold no more")
-        ids = torch.arange(most + 1).repeat_interleave(max(1, 6_000 // (most + 1)))
+        ids = torch.arange(most + 1).repeat_interleave(6_000 // (most + 1))
         index = region_numbers(ids[: len(ids) // 60 * 60].reshape(60, -1).numpy())
         decoded = CODECS[codec].decode(CODECS[codec].encode(index))
         assert (torch.as_tensor(decoded).reshape(index.shape).long() == torch.from_numpy(index).long()).all()
@@ -211,7 +199,6 @@ def test_scenes() -> None:
         assert regions is None or regions.softness == softness
     fitted = scene_of("rocket-1000")
     assert size_of(fitted, "native") == fitted.size and size_of(fitted, "3840 wide")[1] == 3840
-    assert json.dumps(size_of(fitted, "native"))
     images = scene_of("batch")
     assert images.field.means.shape == (64, 256, 2) and images.render().shape == (64, 3, 128, 128)
     assert images.regions is not None and images.regions.labels.shape == (64, 128, 128)
