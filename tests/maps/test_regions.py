@@ -301,17 +301,6 @@ def stated_membership(antialiased: Tensor, widths: Tensor, size: tuple[int, int]
     return powers / powers.sum(0)
 
 
-def straightness(slope: float, factor: int = 8) -> float:
-    """Largest distance, in pixels of the map, of the enlarged contour of a half plane from the line that it is of."""
-    y, x = torch.meshgrid(torch.arange(40) + 0.5, torch.arange(96) + 0.5, indexing="ij")
-    inside = ((y - 20.1) > slope * (x - 48)).long()
-    large = RegionMap(inside).resize((40 * factor, 96 * factor)).membership(1)
-    middle = large[:, 24 * factor : 72 * factor]
-    crossing = (middle > 0.5).double().argmax(0) / factor
-    expected = 20.1 + slope * ((torch.arange(middle.shape[1]) + 0.5) / factor - 24)
-    return float((crossing - expected).abs().max())
-
-
 class TestResize:
     def test_labels_and_softness(self) -> None:
         labels = torch.zeros(40, 40).long()
@@ -337,11 +326,6 @@ class TestResize:
             for region, expected in enumerate(stated_membership(weights, widths, size)):
                 assert (full_map(resized.tiled_table, 0, region) - expected).abs().max() < 1e-6
                 assert (resized.weights(0, region, torch.float64) - expected).abs().max() < 1e-6
-
-    @pytest.mark.parametrize("slope", [0.05, 0.45])
-    def test_straight_contours_stay_straight(self, slope: float) -> None:
-        """Within a fifth of a pixel of the map: a blur alone leaves stairs of a third."""
-        assert straightness(slope) < 0.2
 
     def test_renders_alike_everywhere(self, backend: str) -> None:
         regions = RegionMap(blobs(), 0.6)
