@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
+import json
 import shutil
 import subprocess
+import sys
 
 import pytest
 
-from . import compare, record
+from . import compare, record, worker
 
 pytestmark = pytest.mark.skipif(
     not (compare.ROOT / ".git").exists() or shutil.which("git") is None,
@@ -48,10 +51,19 @@ def test_cases_and_values_that_differ_are_named(capsys) -> None:
     ]  # fmt: skip
 
 
-def test_a_worker_answers() -> None:
-    with compare.Worker(compare.ROOT, threads=1) as worker:
-        assert worker.ask("golden cases") == [*record.CASES]
-        assert worker.ask("digests", "splat/tiled-batch") == record.compute("splat/tiled-batch")
+def test_a_worker_answers(monkeypatch, capsys) -> None:
+    monkeypatch.setattr("sys.stdin", io.StringIO('["golden cases"]\n["digests", "splat/tiled-batch"]\n'))
+    monkeypatch.setattr("sys.stdout", sys.stdout)  # which the worker changes
+    worker.main()
+    names, digests = map(json.loads, capsys.readouterr().out.splitlines())
+    assert names == [*record.CASES] and digests == record.compute("splat/tiled-batch")
+
+
+def test_a_process_is_asked(monkeypatch, tmp_path) -> None:
+    (tmp_path / "worker.py").write_text("import sys\nfor line in sys.stdin: print(line, end='', flush=True)")
+    monkeypatch.setattr(compare, "WORKER", tmp_path / "worker.py")
+    with compare.Worker(tmp_path) as process:
+        assert process.ask("digests", "a") == ["digests", "a"]
 
 
 def test_no_worktree_is_left() -> None:
