@@ -27,7 +27,10 @@ REPORTS = Path(kcgs.__file__).resolve().parent.parent / "benchmarks/reports"
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in EXPERIMENTS]
 )
-def test_quick_form(name: str, tmp_path: Path) -> None:
+def test_quick_form(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a smaller image still, and of two of the budgets."""
+    monkeypatch.setattr("benchmarks.core.images.QUICK_STRIDE", 8)
+    monkeypatch.setattr("benchmarks.convergence.BUDGETS", (2, 60))
     if name in OF_A_GPU and not torch.cuda.is_available():
         pytest.skip("needs a CUDA device")
     main([name, "-o", str(tmp_path), "--quick"])
@@ -65,6 +68,7 @@ def test_a_cpu_in_place_of_a_gpu(name: str, tmp_path: Path, monkeypatch: pytest.
     """All but captures, counts of kernels and new processes, which need CUDA or seconds."""
     module, rows = module_of(name), []
     monkeypatch.setattr(module, "get_context", lambda _: multiprocessing.dummy, raising=False)
+    monkeypatch.setattr("benchmarks.core.images.QUICK_STRIDE", 8)
     for job in module.jobs(Options(tmp_path, quick=True)):
         if job.get("task") not in ("captured", "kernels"):
             arguments = {**job, "device": "cpu", **({"method": "cpu"} if name == "gpu" else {})}
