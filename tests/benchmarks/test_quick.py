@@ -28,8 +28,6 @@ REPORTS = Path(kcgs.__file__).resolve().parent.parent / "benchmarks/reports"
     "name", [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in EXPERIMENTS]
 )
 def test_quick_form(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a smaller image still, and of two of the budgets."""
-    monkeypatch.setattr("benchmarks.core.images.QUICK_STRIDE", 8)
     monkeypatch.setattr("benchmarks.convergence.BUDGETS", (2, 60))
     if name in OF_A_GPU and not torch.cuda.is_available():
         pytest.skip("needs a CUDA device")
