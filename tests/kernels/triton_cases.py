@@ -106,7 +106,7 @@ def assert_close(got: list[Tensor], want: list[Tensor], tolerance: float) -> Non
     "case",
     [
         {"size": (1, 1)},
-        {"size": (15, 17), "regions": 3, "channels": 1, "cutoff": 1e-3, "n": 9},
+        {"size": (15, 17), "regions": 2, "channels": 1, "cutoff": 1e-3, "n": 9},
         {"size": (20, 5), "regions": 3, "softness": 0.7, "batch": 2, "channels": 5, "n": 5},
         {"size": (34, 20), "regions": 4, "softness": {(0, 1): 0.6, (1, 3): 2.0}, "batch": 2, "maps": 2, "n": 3},
         *([{"size": (40, 52), "regions": 3, "softness": 0.7, "batch": 3, "maps": 3, "n": 300}] if GPU else []),

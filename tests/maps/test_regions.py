@@ -128,6 +128,7 @@ def test_membership_of_ids_of_any_kind() -> None:
     """One id counts once, however it is written."""
     regions = RegionMap(torch.tensor([[3, 3, 7, 9]]))
     three = regions.membership(3)
+    assert three.tolist() == [[1, 1, 0, 0]]
     for ids in (np.int64(3), regions.ids[0], torch.tensor([3, 3]), np.array([3, 3]), {3}, (i for i in (3, 3, 99))):
         assert torch.equal(regions.membership(ids), three)
     assert not regions.membership([]).any()
