@@ -27,5 +27,4 @@ def test_agree_with_their_references() -> None:
     done = subprocess.run(command, env=environment, cwd=FOLDER.parent, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     assert " passed" in done.stdout, done.stdout
-    # one case counts what a profiler counts without a GPU
-    assert not torch.cuda.is_available() or ", 1 skipped" in done.stdout, done.stdout
+    assert not torch.cuda.is_available() or "skipped" not in done.stdout, done.stdout

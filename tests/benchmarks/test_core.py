@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import time
@@ -15,13 +14,10 @@ from torch import Tensor
 
 from benchmarks.core.clocks import milliseconds, peak_megabytes, threads
 from benchmarks.core.codecs import available_codecs, decode_file, largest_file
-from benchmarks.core.compare import Comparison, Gain, at_equal_bits, count_wins, differences, losses_table, mean_gain
-from benchmarks.core.fits import QUICK_ITERATIONS, plan
-from benchmarks.core.goals import Goal, goals_table, missed_goals
+from benchmarks.core.compare import Comparison, Gain, differences
 from benchmarks.core.images import load, load_mapped, names
 from benchmarks.core.run import Job, Options, Page, Row, read_rows, run_experiment, write_rows
 from benchmarks.core.scenes import fits_in, scene_of, size_of
-from benchmarks.core.tables import format_value, group_by, means_table
 from benchmarks.labels import CODECS, region_numbers
 from benchmarks.pairs import read_answers
 from benchmarks.rate import bd_rate
@@ -108,12 +104,6 @@ class TestCompare:
         (row,) = differences(rows, [self.comparison], ["psnr"], ["n"])
         assert row["method"] == "ours - other" and row["n"] == 5 and row["psnr"] == gain.mean
         assert (row["psnr low"], row["psnr high"]) == gain.interval
-        text = losses_table(rows, [self.comparison], ["psnr"], ["n"])
-        assert "| ours - other | PSNR | 1 of 5 | d (N = 5) -0.10 |" in text
-        assert mean_gain(rows, self.comparison, "psnr", ["n"]) == gain.mean
-        assert count_wins(rows, self.comparison, "psnr", ["n"]) == "2 of 5"
-        assert math.isnan(mean_gain(rows, Comparison("ours", "nobody"), "psnr"))
-        assert losses_table(rows, [Comparison("other", "nobody")], ["psnr"], ["n"]) == ""
 
     def test_seeds_are_averaged_and_less_may_be_better(self) -> None:
         rows = [{"image": "a", "method": m, "bytes": v} for m, v in (("ours", 90), ("ours", 110), ("other", 120))]
@@ -130,28 +120,6 @@ class TestCompare:
             low, high = Gain(dict(zip("abcdef", values, strict=True)), 0.0, 1).interval or (1.0, 0.0)
             inside += low <= 0 <= high
         assert inside >= 54
-
-    def test_means(self) -> None:
-        rows = [{"image": i, "n": 1_250, "psnr": v, "speed": 10 * v} for i, v in (("a", 30.0), ("b", 31.0))]
-        assert means_table(rows, ["n"], "", ["psnr", "speed", "none"]).splitlines()[-1] == "| 1,250 | 30.50 | 305 |  |"
-        table = means_table([*rows, {"image": "a", "n": 5, "psnr": 7.0}], ["image"], "n", ["psnr", "speed"])
-        assert table.splitlines()[2:] == ["| a | 30.00 / 300 | 7.00 |", "| b | 31.00 / 310 |  |"]
-        assert (format_value("psnr", 1.0, "+"), format_value("", 0.01234), format_value("", None)) == (
-            "+1.00",
-            "0.0123",
-            "",
-        )
-        assert list(group_by(rows, ["n"])) == [(1_250,)]
-
-    def test_equal_bits(self) -> None:
-        sizes = {1_000: 30.0, 2_000: 33.0, 4_000: 36.0}
-        rows = [{"image": "a", "method": "other", "bytes": b, "psnr": v} for b, v in sizes.items()]
-        ours = {"image": "a", "method": "ours", "psnr": 34.0}
-        rows += [{**ours, "bytes": size, "n": size} for size in (1_414, 4_100, 9_000)]
-        first, beyond, far = at_equal_bits(rows, self.comparison, ["psnr"], [])
-        assert first["psnr"] == pytest.approx(31.5, abs=0.01) and first["method"] == "other, equal bits"
-        assert beyond["psnr"] == pytest.approx(36.1, abs=0.02) and "psnr" not in far
-        assert first["n"] == 1_414
 
     def test_bd_rate(self) -> None:
         other = [{"bytes": b, "psnr": 10 * math.log10(b)} for b in (1_000, 2_000, 3_000, 4_000)]
@@ -177,35 +145,25 @@ class TestImages:
             image, labels = load(name, str(data_root))
             assert (labels is not None) == (group == "davis") and image.shape[0] == 3
 
-    def test_plan(self) -> None:
-        methods: Any = {"best": ("best", {}), "paper": ("paper", {"clamp": True})}
-        jobs = plan(["a"], (5, 6), methods, Options(Path()))
-        assert [job["n"] for job in jobs] == [5, 5, 6, 6]
-        assert jobs[0]["settings"] == {} and jobs[1]["settings"] == {"clamp": True}
-        quick = plan(["a"], (5,), methods, Options(Path(), quick=True))
-        assert {job["settings"]["iterations"] for job in quick} == {QUICK_ITERATIONS}
-
 
 class TestCodecs:
     @pytest.mark.parametrize("codec", available_codecs())
     def test_largest_file(self, codec: str, astronaut: Tensor) -> None:
-        image = astronaut[:, 128:256, 128:256].contiguous()
-        files = [largest_file(codec, image, size) for size in (1_500, 3_000)]
-        assert all(0.7 * most < len(file) <= most for file, most in zip(files, (1_500, 3_000), strict=True))
+        image = astronaut[:, 128:192, 192:256].contiguous()
+        files = [largest_file(codec, image, size) for size in (1_000, 2_000)]
+        assert all(0.7 * most < len(file) <= most for file, most in zip(files, (1_000, 2_000), strict=True))
         assert psnr(decode_file(files[0]), image) < psnr(decode_file(files[1]), image)
         # no file is as small
         assert len(largest_file(codec, image, 10)) > 10
 
     @pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # of pycocotools
     @pytest.mark.parametrize("codec", CODECS)
-    @pytest.mark.parametrize("most", [5, 400, 70_000])
+    @pytest.mark.parametrize("most", [5, 400])
     def test_label_maps(self, codec: str, most: int) -> None:
         pytest.importorskip(CODECS[codec].package, reason="needs pip install 'kcgs[bench]'")
         if codec == "RLE" and most > 5:
             pytest.skip("a mask for each region")
-        if codec in ("PNG", "JPEG XL") and most > 65_535:
-            pytest.skip("16 bits hold no more")
-        ids = torch.arange(most + 1).repeat_interleave(max(1, 6_000 // (most + 1)))
+        ids = torch.arange(most + 1).repeat_interleave(6_000 // (most + 1))
         index = region_numbers(ids[: len(ids) // 60 * 60].reshape(60, -1).numpy())
         decoded = CODECS[codec].decode(CODECS[codec].encode(index))
         assert (torch.as_tensor(decoded).reshape(index.shape).long() == torch.from_numpy(index).long()).all()
@@ -241,7 +199,6 @@ def test_scenes() -> None:
         assert regions is None or regions.softness == softness
     fitted = scene_of("rocket-1000")
     assert size_of(fitted, "native") == fitted.size and size_of(fitted, "3840 wide")[1] == 3840
-    assert json.dumps(size_of(fitted, "native"))
     images = scene_of("batch")
     assert images.field.means.shape == (64, 256, 2) and images.render().shape == (64, 3, 128, 128)
     assert images.regions is not None and images.regions.labels.shape == (64, 128, 128)
@@ -256,18 +213,3 @@ def test_fits_of_the_data(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert fits_in(tmp_path) == ["dog-7500"]
     assert "without dog-1250, kodim05-10000: DATA/scenes/NAME.safetensors is missing" in capsys.readouterr().err
     assert torch.equal(scene_of("dog-7500 soft", str(tmp_path)).render(), scene.render())
-
-
-def test_goals() -> None:
-    goals = [
-        Goal("W4", "both_ms", 2.4, 2.5),
-        Goal("W4", "peak_MB", 200.0, 150.0),
-        Goal("Kodak", "psnr", 36.5, 36.6, True),
-    ]
-    assert missed_goals(goals) == "1 of 3 goals are missed: W4, forward and backward, ms."
-    assert goals_table(goals).splitlines()[4:] == [
-        "| W4 | forward and backward, ms | <= 2.4 | 2.5 | missed |",
-        "| W4 | peak MB | <= 200 | 150 | reached |",
-        "| Kodak | PSNR | >= 36.50 | 36.60 | reached |",
-    ]
-    assert missed_goals(goals[1:]) == "" and goals_table([]) == ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing.dummy
 import re
 import shutil
 from pathlib import Path
@@ -26,7 +27,8 @@ REPORTS = Path(kcgs.__file__).resolve().parent.parent / "benchmarks/reports"
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in EXPERIMENTS]
 )
-def test_quick_form(name: str, tmp_path: Path) -> None:
+def test_quick_form(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("benchmarks.convergence.BUDGETS", (2, 60))
     if name in OF_A_GPU and not torch.cuda.is_available():
         pytest.skip("needs a CUDA device")
     main([name, "-o", str(tmp_path), "--quick"])
@@ -60,9 +62,11 @@ def test_no_gpu(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
 
 
 @pytest.mark.parametrize("name", OF_A_GPU)
-def test_a_cpu_in_place_of_a_gpu(name: str, tmp_path: Path) -> None:
-    """All but captures and counts of kernels, which need CUDA."""
+def test_a_cpu_in_place_of_a_gpu(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All but captures, counts of kernels and new processes, which need CUDA or seconds."""
     module, rows = module_of(name), []
+    monkeypatch.setattr(module, "get_context", lambda _: multiprocessing.dummy, raising=False)
+    monkeypatch.setattr("benchmarks.core.images.QUICK_STRIDE", 8)
     for job in module.jobs(Options(tmp_path, quick=True)):
         if job.get("task") not in ("captured", "kernels"):
             arguments = {**job, "device": "cpu", **({"method": "cpu"} if name == "gpu" else {})}

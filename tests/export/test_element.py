@@ -86,7 +86,6 @@ def random_scene(kind: str, channels: int = 3) -> Scene:
 
 
 SCENES = [
-    "soft",
     "pairs",
     "hard",
     *(pytest.param(name, marks=pytest.mark.slow) for name in ("plain", "wide", "widest", "grey", *ZOO)),
@@ -159,10 +158,6 @@ class TestPixels:
             image = pixels(page, scene.size)
             np.testing.assert_allclose(image[3], expected[3], atol=LEVELS)
             np.testing.assert_allclose(image[:3] * image[3], expected[:3] * expected[3], atol=LEVELS)
-
-    def test_an_emulated_gpu_is_not_taken(self, page: Browser, site: tuple[Path, str]) -> None:
-        show(page, site, random_scene("soft"))
-        assert page.evaluate("image.renderer") == "cpu"
 
     def test_sums_of_16_bits(self, page: Browser, site: tuple[Path, str]) -> None:
         """As on a GPU that does not blend floats of 32 bits."""
@@ -266,10 +261,6 @@ class TestElement:
         page.evaluate("(image.remove(), image.setAttribute('src', 'none.kcgs'), document.body.append(image), 1)")
         page.do("wait", expression="image.scene === null")
 
-    def test_asks_for_the_file_alone(self, page: Browser, site: tuple[Path, str]) -> None:
-        show(page, site, random_scene("soft"), "zoom regions")
-        assert page.do("requests") == [site[1] + name for name in ("", "kcgs-image.js", "scene.kcgs")]
-
     def test_a_file_that_ends_early_shows_what_is_whole(self, page: Browser, site: tuple[Path, str]) -> None:
         show(page, site, layered_file()[: len(layered_file()) * 3 // 4])
         *progress, last = [name for name, _ in page.evaluate("kcgs.events")]
@@ -318,12 +309,6 @@ class TestElement:
         page.do("press", key="Enter", on="kcgs-image")
         (_, click), (_, enter) = [event for event in page.evaluate("kcgs.events") if event[0] == "regionclick"]
         assert click["id"] == enter["id"] == int(scene.regions.labels[30, 45])
-
-    def test_a_page_of_many_frees_what_it_leaves(self, page: Browser, site: tuple[Path, str]) -> None:
-        scene = show(page, site, random_scene("soft"))
-        for _ in range(3):
-            show(page, site, random_scene("soft"), 'renderer="webgl2"')
-        check(page, scene.render())
 
 
 class TestPage:

@@ -17,12 +17,10 @@ from kcgs.maps.widths import blurs_of
 CUTOFF = 1e-4
 
 
-def make_inputs(
-    size: tuple[int, int] = (110, 150), *, n: int = 40, batch: int = 1, maps: int = 0, softness: float = 0.0
-) -> SplatInputs:
+def make_inputs(size: tuple[int, int], batch: int, maps: int, softness: float) -> SplatInputs:
     """Scatter Gaussians of half a pixel to twice the image, around and in it; some of no region of the map."""
     generator = torch.Generator().manual_seed(0)
-    height, width = size
+    (height, width), n = size, 40
     means = (torch.rand(batch, n, 2, generator=generator) * 1.2 - 0.1) * torch.tensor([width, height])
     sigma = 0.5 * (4 * max(size)) ** torch.rand(batch, n, 1, generator=generator)
     cholesky = sigma * (torch.rand(batch, n, 3, generator=generator) + torch.tensor([0.5, -0.5, 0.5]))
@@ -120,17 +118,14 @@ def assert_close(got: list[Tensor], want: list[Tensor], tolerance: float) -> Non
 @pytest.mark.parametrize(
     ("size", "batch", "maps", "softness"),
     [
-        ((110, 150), 1, 0, 0.0),
         ((110, 150), 2, 2, 0.7),
-        ((33, 17), 2, 1, 0.7),
         ((33, 17), 1, 1, 0.0),
         ((5, 70), 2, 0, 0.0),
-        ((5, 70), 2, 2, 0.7),
         ((9, 8), 2, 1, 0.7),
     ],
 )
 def test_cpu_agrees(size: tuple[int, int], batch: int, maps: int, softness: float) -> None:
-    inputs = make_inputs(size, batch=batch, maps=maps, softness=softness)
+    inputs = make_inputs(size, batch, maps, softness)
     plan = cpu.plan(inputs)
     assert plan is not None and bool(plan.lists.live.any()) == (max(size) > 32)
     got = render(cpu, inputs)
@@ -138,12 +133,3 @@ def test_cpu_agrees(size: tuple[int, int], batch: int, maps: int, softness: floa
     want = render(reference, double(inputs)._replace(cutoff=0.0))
     assert_close(got[:1], want[:1], 5e-4)
     assert_close(got[1:], want[1:], 3e-3)
-
-
-def test_one_gaussian_of_each_level() -> None:
-    inputs = make_inputs((150, 110), n=4, maps=1, softness=0.7)
-    sigma = 2.0 ** torch.arange(4) / (max_spacing(CUTOFF) / 2**0.25) * 1.01
-    cholesky = sigma[:, None] * torch.tensor([[[1.0, 0.0, 1.0]]])
-    inputs = inputs._replace(cholesky=cholesky, region_positions=torch.tensor([[0, 1, 2, 1]]))
-    assert choose_levels(cholesky[0].double(), max_spacing(CUTOFF), 4).tolist() == [0, 1, 2, 3]
-    assert_close(render(cpu, inputs), render_formulas(inputs), 2e-6)

@@ -1,8 +1,7 @@
-"""The CPU kernel beyond what every backend is tested for: threads, channels, needles, refusals."""
+"""The CPU kernel beyond what every backend is tested for: threads, memory, one pass, refusals."""
 
 from __future__ import annotations
 
-import math
 import os
 import subprocess
 import sys
@@ -66,7 +65,7 @@ def same(first: list[Tensor], second: list[Tensor]) -> bool:
 @pytest.mark.usefixtures("threads")
 def test_same_bits_for_any_number_of_threads() -> None:
     results = []
-    for count in (1, 2, 3, 7):
+    for count in (1, 2, 7):
         torch.set_num_threads(count)
         results.append(render(crowd()))
     assert all(same(results[0], other) for other in results[1:])
@@ -124,12 +123,12 @@ def one_pass():
     squared_error_gradients(image, *tables, field.region_ids, regions, cutoff=1e-4, backend="cpu")
 
 for call in (forward, both, one_pass):
-    for _ in range(10):
+    for _ in range(5):
         call()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    for _ in range(20):
+    for _ in range(10):
         call()
-    print(call.__name__, (resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before) / 20, flush=True)
+    print(call.__name__, (resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before) / 10, flush=True)
 
 pid = os.fork()
 forward()
@@ -161,26 +160,6 @@ def test_one_pass_of_squared_error(scene: tuple[Tensor, ...], backend: str) -> N
     image.backward(image.detach() - target)
     got = squared_error_gradients(target, *scene[:4], regions, cutoff=1e-4, backend=backend)  # type: ignore[misc]
     assert all(b.grad is not None and torch.equal(a, b.grad) for a, b in zip(got, leaves, strict=True))
-
-
-@pytest.mark.parametrize("channels", [1, 2, 4, 16])
-def test_channels_do_not_mix(scene: tuple[Tensor, ...], channels: int) -> None:
-    """Any number of channels is the same loop: each comes out as it does beside two others."""
-    colors = scene[2].repeat(1, 6)[:, :channels]
-    several = render((*scene[:2], colors, *scene[3:]))[0]
-    assert torch.equal(several, render(scene)[0].repeat(6, 1, 1)[:channels])
-
-
-def test_slanted_needles() -> None:
-    angles = torch.linspace(0.01, math.pi, 40, dtype=torch.float64)
-    cos, sin = angles.cos(), angles.sin()
-    l11 = torch.hypot(300 * cos, 0.4 * sin)
-    cholesky = torch.stack([l11, (300**2 - 0.4**2) * sin * cos / l11, 300 * 0.4 / l11], -1)
-    means = torch.tensor([[100.0, 75.0]], dtype=torch.float64).repeat(40, 1)
-    colors = torch.ones(40, 1, dtype=torch.float64)
-    want = region_splat(means, cholesky, colors, size=(150, 200), cutoff=0, backend="reference")
-    got = region_splat(means.float(), cholesky.float(), colors.float(), size=(150, 200), cutoff=0, backend="cpu")
-    assert (got - want).abs().max() < 2e-3  # the needle's float32 parameters themselves move it
 
 
 def test_gradient_that_is_not_contiguous(scene: tuple[Tensor, ...]) -> None:

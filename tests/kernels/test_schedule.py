@@ -19,10 +19,10 @@ def parents(row: Row, counts: tuple[int, ...]) -> set[Row]:
     return {(level + 1, image, n) for n in (number // 2, (number + 1) // 2) if n < counts[level + 1]}
 
 
-@pytest.mark.parametrize("counts", [(1,), (2, 2), (5, 3, 2), (8, 5, 3, 2), (30, 16, 8, 4, 3, 2), (7, 4, 2)])
+@pytest.mark.parametrize("counts", [(1,), (2, 2), (30, 16, 8, 4, 3, 2)])
 @pytest.mark.parametrize("kind", [ADDS, GATHERS, ADDS | GATHERS])
-@pytest.mark.parametrize("batch", [1, 3])
-def test_order(counts: tuple[int, ...], kind: int, batch: int) -> None:
+def test_order(counts: tuple[int, ...], kind: int) -> None:
+    batch = 2
     tasks = order_tasks(counts, batch, kind, 300, 500).tolist()
     starts = [task[0] for task in tasks]
     assert all(start <= k for k, start in enumerate(starts))

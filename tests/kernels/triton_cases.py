@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
 import pytest
 import torch
+import triton
 from torch import Tensor
 
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer
 from kcgs.functional import region_splat
-from kcgs.functional.operator import splat_operator
 from kcgs.kernels import SplatInputs, cuda, reference, settle, without_waiting
 from kcgs.kernels.cuda import capacity, gather, plan, render, triton_function
 from kcgs.maps import MapTable, with_positions
@@ -22,11 +21,15 @@ from kcgs.optim import GaussianAdam
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 GPU = DEVICE.type == "cuda"
-needs_gpu = pytest.mark.skipif(not GPU, reason="a CUDA graph needs a GPU")
+needs_gpu = pytest.mark.skipif(not GPU, reason="needs a GPU")
 if triton_function.is_interpreted():
     # it would patch the whole language anew at every call of a function; plain Python is a part of what calls it
-    render.weigh = gather.weigh = render.weigh.fn
-    gather._geometry_gradient = gather.geometry_gradient
+    for module in (plan, render, gather):
+        module.core = triton.language.core  # a launch patches it, too
+    for module in (triton.language, plan, render, gather):
+        for name, function in [*vars(module).items()]:
+            if isinstance(function, triton.KernelInterface):
+                setattr(module, name, function.fn)
 
 
 def make_inputs(
@@ -98,31 +101,27 @@ def assert_close(got: list[Tensor], want: list[Tensor], tolerance: float) -> Non
         assert cosine >= 1 - tolerance
 
 
-def assert_matches_reference(inputs: SplatInputs, tolerance: float = 5e-6) -> None:
-    assert_close(evaluate(cuda, inputs), evaluate(reference, to_double(inputs)), tolerance)
-
-
-# no map, hard and soft contours; one map and one for each image; one channel, a part of a block, more than a block
+# no map, hard and soft contours; one map and one for each image; one channel, a block, more than a block
 @pytest.mark.parametrize(
     "case",
     [
         {"size": (1, 1)},
-        {"size": (15, 17), "regions": 3, "channels": 1, "cutoff": 1e-3},
-        {"size": (9, 33), "regions": 3, "softness": 0.7, "batch": 3, "channels": 5, "n": 8},
-        {"size": (9, 20), "regions": 2, "softness": 1.5, "batch": 2, "maps": 2, "channels": 9, "n": 6},
-        {"size": (40, 52), "regions": 4, "softness": {(0, 1): 0.6, (1, 3): 2.0}, "batch": 2, "maps": 2, "n": 3},
+        {"size": (15, 17), "regions": 2, "channels": 1, "cutoff": 1e-3, "n": 9},
+        {"size": (20, 5), "regions": 3, "softness": 0.7, "batch": 2, "channels": 5, "n": 5},
+        {"size": (34, 20), "regions": 4, "softness": {(0, 1): 0.6, (1, 3): 2.0}, "batch": 2, "maps": 2, "n": 3},
         *([{"size": (40, 52), "regions": 3, "softness": 0.7, "batch": 3, "maps": 3, "n": 300}] if GPU else []),
         *([{"size": (300, 400), "regions": 3, "n": 700, "batch": 2, "cutoff": 1e-4, "channels": 32}] if GPU else []),
     ],
     ids=str,
 )
 def test_agrees_with_the_reference(case: dict[str, Any]) -> None:
-    assert_matches_reference(make_inputs(**case))
+    inputs = make_inputs(**case)
+    assert_close(evaluate(cuda, inputs), evaluate(reference, to_double(inputs)), 5e-6)
 
 
 def test_error() -> None:
     """The gradients of half the squared error are those of its image, render minus target."""
-    inputs = make_inputs(12, regions=2, softness=0.5)
+    inputs = make_inputs(4, (9, 5), regions=2, softness=0.5)
     target = 0.5 * probe(inputs)
     double = to_double(inputs)
     error = reference.kernel_for(double).render(None, double) - target
@@ -134,41 +133,22 @@ def test_error() -> None:
 
 
 def test_more_than_a_block_in_a_tile() -> None:
-    """300 Gaussians of one tile, needles, giants and dots among them, and some outside of the image."""
-    inputs = make_inputs(300, size=(4, 5), channels=1)
-    scales = 10.0 ** torch.linspace(-2, 5, 300, device=DEVICE)
+    """130 Gaussians of one tile, needles, giants and dots among them, and some outside of the image."""
+    inputs = make_inputs(130, size=(4, 2), channels=1)
+    scales = 10.0 ** torch.linspace(-2, 5, 130, device=DEVICE)
     cholesky = inputs.cholesky.clone()
     cholesky[0, ::3] = torch.tensor([0.7, 0.2, 0.5], device=DEVICE)
     cholesky[0, 1::3, 0] = scales[1::3]
     cholesky[0, 2::3, 2] = scales[2::3]
-    inputs = inputs._replace(cholesky=cholesky, colors=inputs.colors / 300)
+    inputs = inputs._replace(cholesky=cholesky, colors=inputs.colors / 130)
     got, want = evaluate(cuda, inputs), evaluate(reference, to_double(inputs))
     assert (got[0] - want[0]).abs().max() <= 5e-6
     assert all(torch.isfinite(t).all() for t in got)
     assert_close([got[3]], [want[3]], 2e-5)
 
 
-def test_slanted_needles() -> None:
-    angles = torch.linspace(0.1, math.pi, 20, dtype=torch.float64)
-    cos, sin = angles.cos(), angles.sin()
-    l11 = torch.hypot(1e4 * cos, sin)
-    cholesky = torch.stack([l11, (1e8 - 1) * sin * cos / l11, 1e4 / l11], -1).float()[None].to(DEVICE)
-    inputs = make_inputs(size=(16, 20) if GPU else (9, 16))._replace(cholesky=cholesky)
-    got = evaluate(cuda, inputs)
-    assert (got[0] - evaluate(reference, to_double(inputs))[0]).abs().max() < 1e-5 * 20
-    assert all(torch.isfinite(t).all() for t in got)
-
-
-def test_far_weights_are_zero() -> None:
-    """At cutoff 0 a weight below e^-80 is 0, however large its colour."""
-    means, cholesky = torch.tensor([[[30.0, 8.0]]], device=DEVICE), torch.tensor([[[1.0, 0.0, 1.0]]], device=DEVICE)
-    inputs = SplatInputs(means, cholesky, torch.full((1, 1, 1), 1e30, device=DEVICE), None, None, (16, 16), 0.0)
-    for tensor in evaluate(cuda, inputs):
-        assert torch.equal(tensor, torch.zeros_like(tensor))
-
-
 def test_gradient_layouts_and_colours_alone() -> None:
-    inputs = make_inputs(size=(9, 16))
+    inputs = make_inputs(4, (5, 3))
     steps = cuda.kernel_for(inputs)
     lists = steps.plan(inputs)
     ones = torch.ones(1, 3, *inputs.size, device=DEVICE)
@@ -180,8 +160,7 @@ def test_gradient_layouts_and_colours_alone() -> None:
     assert means is None and cholesky is None and torch.equal(colors, gradients[2])
 
 
-@pytest.mark.parametrize("count", [0, 3])
-@pytest.mark.parametrize("regions", [1, 2])
+@pytest.mark.parametrize(("count", "regions"), [(0, 1), (3, 2)])
 def test_nothing_to_render(count: int, regions: int) -> None:
     inputs = make_inputs(count, regions=regions)
     inputs = inputs._replace(means=torch.full_like(inputs.means, 1e6))
@@ -191,10 +170,11 @@ def test_nothing_to_render(count: int, regions: int) -> None:
         assert torch.equal(gradient, torch.zeros_like(array))
 
 
+@needs_gpu  # the interpreter runs one program after the other
 def test_same_bits_every_time() -> None:
-    inputs = make_inputs(4000 if GPU else 20, (270, 480) if GPU else (9, 16), regions=3, softness=0.7)
+    inputs = make_inputs(4000, (270, 480), regions=3, softness=0.7)
     first = evaluate(cuda, inputs)
-    for _ in range(5 if GPU else 1):
+    for _ in range(5):
         assert all(torch.equal(a, b) for a, b in zip(first, evaluate(cuda, inputs), strict=True))
 
 
@@ -205,10 +185,8 @@ def test_without_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
     """A plan that does not wait has room for 1.5 times the most; beyond that all is NaN until there is more room."""
     monkeypatch.setattr(capacity, "_SPARE_SLOTS", 1)
     capacity._max_slots.clear()
-    inputs = make_inputs(8, size=(9, 48))
-    inputs = inputs._replace(
-        cholesky=torch.full_like(inputs.cholesky, 0.4).mul_(torch.tensor([1, 0, 1], device=DEVICE))
-    )
+    dot = torch.tensor([0.1, 0.0, 0.1], device=DEVICE)
+    inputs = make_inputs(2, (48, 2))._replace(cholesky=dot.expand(1, 2, 3))
     large = inputs._replace(cholesky=40 * inputs.cholesky)
     expected = evaluate(cuda, inputs)
     with without_waiting():
@@ -271,17 +249,13 @@ def test_refuses_what_the_cpu_refuses() -> None:
 
 
 def test_operator() -> None:
-    """The operator and its gradient mutate and alias nothing; tracing is the same for every backend."""
-    inputs = make_inputs(4, size=(8, 16))
-    labels = (torch.arange(16, device=DEVICE) // 9).expand(8, 16).contiguous()
-    ids = torch.tensor([[0, 1, 0, 1]], device=DEVICE)
-    settings = ids, *MapTable(labels), 8, 16, 0.0
-    backward = torch.ops.kcgs.region_splat_backward.default
-    grad = torch.rand(1, 3, 8, 16, device=DEVICE)
-    torch.library.opcheck(splat_operator, (*inputs.gaussians, *settings, "cuda"), test_utils="test_schema")
-    torch.library.opcheck(backward, (grad, *inputs.gaussians, *settings, "cuda", True), test_utils="test_schema")
-    gradients, expected = (backward(grad, *inputs.gaussians, *settings, name, True) for name in ("cuda", "reference"))
-    for a, b in zip(gradients, expected, strict=True):
+    results = []
+    for backend in ("cuda", "reference"):
+        arguments = {**small_splat(), "backend": backend}
+        leaves = [arguments[name].requires_grad_() for name in ("means", "cholesky", "colors")]
+        image = region_splat(**arguments)
+        results.append([image.detach(), *torch.autograd.grad(image.square().sum(), leaves)])
+    for a, b in zip(*results, strict=True):
         assert b.any() and (a - b).abs().max() <= 1e-5 * b.abs().max()
 
 

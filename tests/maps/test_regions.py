@@ -29,16 +29,13 @@ class TestRegionMap(
         "test_module": "it is data, which a Scene keeps in its state",
     },
 ):
-    @pytest.mark.parametrize("softness", [0.0, 0.7, {(0, 1): 0.5}])
-    def test_smoke(
-        self, device: torch.device, dtype: torch.dtype, softness: float | dict[tuple[int, int], float]
-    ) -> None:
-        regions = RegionMap(blobs().to(device), softness)
+    def test_smoke(self, device: torch.device, dtype: torch.dtype) -> None:
+        regions = RegionMap(blobs().to(device), {(0, 1): 0.5})
         assert regions.labels.device.type == device.type and "4 regions, size=(45, 70)" in repr(regions)
         weights = regions.membership(0, dtype)
         assert weights.dtype == dtype and weights.isfinite().all() and weights.any()
 
-    @pytest.mark.parametrize("lead", [(), (1,), (2,)])
+    @pytest.mark.parametrize("lead", [(), (2,)])
     def test_cardinality(self, device: torch.device, lead: tuple[int, ...]) -> None:
         regions = RegionMap(blobs((45, 69)).to(device).expand(*lead, 45, 69))
         assert regions.size == (45, 69) and regions.labels.shape == (*lead, 45, 69) and regions.ids.shape == (4,)
@@ -46,40 +43,30 @@ class TestRegionMap(
         assert not lead or regions[0].labels.shape == (45, 69)
         assert regions.resize((7, 9)).labels.shape == (*lead, 7, 9)
 
-    @pytest.mark.parametrize("softness", [0.0, 0.7])
-    def test_dynamo(self, device: torch.device, dtype: torch.dtype, softness: float) -> None:
+    def test_dynamo(self, device: torch.device, dtype: torch.dtype) -> None:
         """A map is made outside of a graph, for the number of its regions is found in values; read inside."""
-        regions, other = (RegionMap(blobs(seed=k).to(device), softness) for k in (0, 1))
 
         def shares(of: RegionMap) -> Tensor:
             return of.labels.to(dtype) / of.num_regions + of.size[0] + of.index_of(of.ids).sum()
 
-        self.assert_compiles(shares, regions, backend="aot_eager")
-        self.assert_compiles(shares, other, backend="aot_eager")
+        self.assert_compiles(shares, RegionMap(blobs().to(device), 0.7), backend="aot_eager")
 
     def test_feature(self, device: torch.device) -> None:
         """Ids need not be consecutive."""
-        regions = RegionMap(torch.tensor([[255, 0], [7, 100_000]], device=device))
-        assert regions.ids.tolist() == [0, 7, 255, 100_000]
-        assert regions.num_regions == 4
+        regions = RegionMap.from_labels(torch.tensor([[255, 0], [7, 100_000]], device=device), 0.7)
+        assert regions.ids.tolist() == [0, 7, 255, 100_000] and regions.softness == 0.7
         assert regions.index_of(torch.tensor([7, 8, 100_000, 0], device=device)).tolist() == [1, -1, 3, 0]
-
-    @pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.int32, torch.int64])
-    def test_integer_dtypes(self, dtype: torch.dtype) -> None:
-        assert RegionMap(torch.tensor([[1, 2]], dtype=dtype)).labels.dtype == torch.int64
 
     @pytest.mark.parametrize(
         ("labels", "softness", "error", "words"),
         [
             (torch.zeros(3, 3).cfloat(), 0.0, TypeError, "labels must have an integer dtype; got torch.complex64"),
             (torch.tensor([[1.0, 2.25]]), 0.0, ValueError, "labels must hold whole numbers; got 2.25"),
-            (torch.tensor([[1.0, math.nan]]), 0.0, ValueError, "labels must hold whole numbers; got nan"),
             (torch.tensor([[1.0, 1e30]]), 0.0, ValueError, "labels must hold whole numbers; got 1.0"),
             (torch.zeros(3, dtype=torch.long), 0.0, ValueError, "labels must have 2 or 3 dimensions"),
             (torch.zeros(0, 4, dtype=torch.long), 0.0, ValueError, "at least one pixel"),
             (-torch.ones(3, 3, dtype=torch.long), 0.0, ValueError, "non-negative ids; got -1"),
             (torch.zeros(3, 3, dtype=torch.long), -0.1, ValueError, r"softness must be in \[0, 64\] pixels; got -0.1"),
-            (torch.zeros(3, 3, dtype=torch.long), math.nan, ValueError, "softness must be in"),
             (torch.zeros(3, 3, dtype=torch.long), "a", TypeError, "softness must be a number of pixels; got 'a'"),
             ([[0]], 0.0, TypeError, "labels must be a Tensor, a numpy array, a PIL image or a path; got list"),
         ],
@@ -88,20 +75,12 @@ class TestRegionMap(
         with pytest.raises(error, match=words):
             RegionMap(labels, softness)
 
-    def test_constructor(self) -> None:
-        regions, other = RegionMap(blobs(), 0.7), RegionMap.from_labels(blobs(), 0.7)
-        assert regions.softness == other.softness and torch.equal(regions.labels, other.labels)
-        assert regions.device == torch.device("cpu") and RegionMap(labels=blobs()).softness == 0.0
-
-    @pytest.mark.parametrize(
-        ("kind", "dtype"), [(torch.Tensor, torch.float16), (torch.Tensor, torch.int64), (np.ndarray, torch.float32)]
-    )
-    def test_labels_of_augmentations(self, kind: type, dtype: torch.dtype) -> None:
+    def test_labels_of_augmentations(self) -> None:
         """Kornia returns masks as floating (B, 1, H, W); a map is the same, and all else that takes labels."""
         labels = torch.stack([blobs(seed=k) for k in (0, 1)])
-        mask = labels[:, None].to(dtype)
-        regions = RegionMap(mask if kind is torch.Tensor else mask.numpy())
-        assert torch.equal(regions.labels, labels)
+        mask = labels[:, None].half()
+        for given in (mask, mask.float().numpy()):
+            assert torch.equal(RegionMap(given).labels, labels)
         assert torch.equal(edge_band(mask), edge_band(labels))
         field = GaussianField.random(20, (45, 70), regions=labels[0], seed=0)
         tensors = [t.detach().expand(2, *t.shape) for t in (field.means, field.cholesky, field.colors)]
@@ -149,6 +128,7 @@ def test_membership_of_ids_of_any_kind() -> None:
     """One id counts once, however it is written."""
     regions = RegionMap(torch.tensor([[3, 3, 7, 9]]))
     three = regions.membership(3)
+    assert three.tolist() == [[1, 1, 0, 0]]
     for ids in (np.int64(3), regions.ids[0], torch.tensor([3, 3]), np.array([3, 3]), {3}, (i for i in (3, 3, 99))):
         assert torch.equal(regions.membership(ids), three)
     assert not regions.membership([]).any()
@@ -167,7 +147,6 @@ class TestPairSoftness:
         labels = torch.tensor([[3, 5, 9]])
         assert RegionMap(labels, {(3, 5): 0.7, (9, 3): 0.7, (5, 9): 0.7}).softness == 0.7
         assert RegionMap(labels, {(3, 5): 0.0}).softness == 0.0
-        assert RegionMap(labels, {}).softness == 0.0
         assert RegionMap(torch.ones(2, 2).long(), {}).softness == 0.0
 
     def test_merged_regions_have_the_mean_along_their_contours(self) -> None:
@@ -194,10 +173,7 @@ class TestPairSoftness:
             ({(0, 4): 0.7}, ValueError, r"softness must map pairs of two different ids in the map; got \(0, 4\)"),
             ({(0, 1): 0.7, (1, 0): 0.7}, ValueError, r"name a pair once; got \(0, 1\) and \(1, 0\)"),
             ({(0, 1): 64.5}, ValueError, r"softness of \(0, 1\) must be in \[0, 64\] pixels; got 64.5"),
-            ({(0, 1): math.nan}, ValueError, "softness of"),
-            ({(0, 1): "a"}, TypeError, r"softness of \(0, 1\) must be a number of pixels; got 'a'"),
             ({0: 0.7}, TypeError, "softness must map pairs of ids to pixels; got the key 0"),
-            ({(0, 1, 2): 0.7}, TypeError, "softness must map pairs"),
         ],
     )
     def test_exception(self, softness: object, error: type[Exception], words: str) -> None:
@@ -326,17 +302,6 @@ def stated_membership(antialiased: Tensor, widths: Tensor, size: tuple[int, int]
     return powers / powers.sum(0)
 
 
-def straightness(slope: float, factor: int = 8) -> float:
-    """Largest distance, in pixels of the map, of the enlarged contour of a half plane from the line that it is of."""
-    y, x = torch.meshgrid(torch.arange(40) + 0.5, torch.arange(96) + 0.5, indexing="ij")
-    inside = ((y - 20.1) > slope * (x - 48)).long()
-    large = RegionMap(inside).resize((40 * factor, 96 * factor)).membership(1)
-    middle = large[:, 24 * factor : 72 * factor]
-    crossing = (middle > 0.5).double().argmax(0) / factor
-    expected = 20.1 + slope * ((torch.arange(middle.shape[1]) + 0.5) / factor - 24)
-    return float((crossing - expected).abs().max())
-
-
 class TestResize:
     def test_labels_and_softness(self) -> None:
         labels = torch.zeros(40, 40).long()
@@ -349,7 +314,7 @@ class TestResize:
         assert large.resize((40, 40)) is regions and large.resize((120, 120)) is large
         assert RegionMap(torch.zeros(4, 5).long()).resize((9, 9)).num_regions == 1
 
-    @pytest.mark.parametrize("softness", [0.0, 0.8, {(0, 1): 0.0, (0, 2): 1.1, (1, 2): 2.3}])
+    @pytest.mark.parametrize("softness", [0.0, {(0, 1): 0.0, (0, 2): 1.1, (1, 2): 2.3}])
     def test_memberships_are_the_stated_ones(self, softness: Any) -> None:
         """For whole maps and in tiles."""
         labels = blobs() % 3
@@ -357,16 +322,11 @@ class TestResize:
         regions = RegionMap(labels, softness)
         widths = membership_of(regions).variances[0].sqrt()
         weights = stated_weights(labels, widths)
-        for size in ((45, 71), (23, 31), (91, 140), (300, 70), (7, 500), (1, 1)):
+        for size in ((23, 31), (91, 140), (7, 500), (1, 1)):
             resized = membership_of(regions.resize(size))
             for region, expected in enumerate(stated_membership(weights, widths, size)):
                 assert (full_map(resized.tiled_table, 0, region) - expected).abs().max() < 1e-6
                 assert (resized.weights(0, region, torch.float64) - expected).abs().max() < 1e-6
-
-    @pytest.mark.parametrize("slope", [0.05, 0.13, 0.45])
-    def test_straight_contours_stay_straight(self, slope: float) -> None:
-        """Within a fifth of a pixel of the map: a blur alone leaves stairs of a third."""
-        assert straightness(slope) < 0.2
 
     def test_renders_alike_everywhere(self, backend: str) -> None:
         regions = RegionMap(blobs(), 0.6)
@@ -376,10 +336,9 @@ class TestResize:
         torch.testing.assert_close(image, Scene(field, regions)((90, 140)), rtol=1e-4, atol=1e-4)
         assert torch.equal(image, render(field, regions.resize((90, 140)), (90, 140)))
 
-    @pytest.mark.parametrize("size", [(0, 3), (3,), (2.5, 3), "ab", None])
-    def test_bad_size(self, size: object) -> None:
-        with pytest.raises((ValueError, TypeError), match="size must"):
-            RegionMap(blobs()).resize(size)  # type: ignore[arg-type]
+    def test_bad_size(self) -> None:
+        with pytest.raises(ValueError, match="size must"):
+            RegionMap(blobs()).resize((0, 3))
 
 
 class TestLookup:
@@ -398,12 +357,9 @@ class TestEdgeBand(BaseTester, without={"test_gradcheck": "labels are integers",
         band = edge_band(blobs().to(device))
         assert band.device.type == device.type and band.dtype == torch.bool and band.any()
 
-    @pytest.mark.parametrize("lead", [(), (1,), (3,)])
-    def test_cardinality(self, device: torch.device, lead: tuple[int, ...]) -> None:
-        maps = torch.stack([blobs(seed=k) for k in range(3)])[: lead[0]] if lead else blobs()
-        band = edge_band(maps.to(device))
-        assert band.shape == maps.shape
-        assert not lead or torch.equal(band[-1], edge_band(maps[-1].to(device)))
+    def test_cardinality(self, device: torch.device) -> None:
+        maps = torch.stack([blobs(seed=k) for k in range(2)]).to(device)
+        assert torch.equal(edge_band(maps), torch.stack([edge_band(one) for one in maps]))
 
     def test_dynamo(self, device: torch.device, dtype: torch.dtype) -> None:
         self.assert_compiles(lambda labels: edge_band(labels, 2).to(dtype), blobs().to(device))
@@ -422,7 +378,7 @@ class TestEdgeBand(BaseTester, without={"test_gradcheck": "labels are integers",
         # smaller than the band
         assert edge_band(torch.tensor([[0, 1]])).all() and edge_band(torch.tensor([[0], [1], [1]])).all()
 
-    @pytest.mark.parametrize("width", [0, 0.5, -1, math.inf, math.nan, "5"])
+    @pytest.mark.parametrize("width", [0.5, math.inf, "5"])
     def test_exception(self, width: Any) -> None:
         with pytest.raises((TypeError, ValueError), match="width must be"):
             edge_band(blobs(), width)

@@ -41,13 +41,11 @@ def pairs(regions: int, widths: list[float]) -> dict[tuple[int, int], float]:
 
 
 MAPS: dict[str, Tensor] = {
-    "one pixel": torch.zeros(1, 1, 1).long(),
     "one row": torch.arange(50).view(1, 1, 50) // 7,
     "one region": torch.zeros(2, 20, 40).long(),
     "eight in a tile": cake(8),
-    "batch": random_labels(3, 35, 50, regions=4, grain=9),
-    "pixels": random_labels(1, 20, 33, regions=40),
-    "a thousand": random_labels(1, 60, 51, regions=1000),
+    "batch": random_labels(2, 35, 50, regions=4, grain=9),
+    "pixels": random_labels(1, 20, 33, regions=300),
 }
 
 
@@ -97,14 +95,13 @@ def check(result: Tiles, membership: Membership, contours: ContourWidths | None 
         assert (expected[:, : dense.shape[1], : dense.shape[2]] - dense).abs().max() < 1e-6
 
 
-@pytest.mark.parametrize("softness", [0.0, 0.7, 3.0])
-@pytest.mark.parametrize("name", MAPS)
+@pytest.mark.parametrize(("name", "softness"), [*((name, 0.7) for name in MAPS), ("batch", 0.0), ("one row", 3.0)])
 def test_one_width(name: str, softness: float, tiles_of: Callable[[Membership], Tiles]) -> None:
     membership = membership_of(MAPS[name], softness)
     check(tiles_of(membership), membership)
 
 
-@pytest.mark.parametrize("name", ["one row", "eight in a tile", "batch", "pixels"])
+@pytest.mark.parametrize("name", ["eight in a tile", "batch"])
 def test_widths_of_pairs(name: str, tiles_of: Callable[[Membership], Tiles]) -> None:
     softness = pairs(int(MAPS[name].max()) + 1, [0.7, 0.0, 2.2, 1.1])
     membership = membership_of(MAPS[name], softness)
@@ -121,8 +118,10 @@ def test_wide_contours(
     check(tiles_of(membership), membership)
 
 
-@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 1, 60), (2, 40, 55), (1, 90, 3)])
-@pytest.mark.parametrize("values", [[0.0], [0.3, 0.9, 0.0, 1.4], [0.5, 12.0]])
+@pytest.mark.parametrize(
+    ("shape", "values"),
+    [((1, 1, 60), [0.3, 0.9, 0.0, 1.4]), ((2, 40, 35), [0.3, 0.9, 0.0, 1.4]), ((1, 90, 3), [0.5, 12.0])],
+)
 def test_widths_of_pixels(shape: tuple[int, int, int], values: list[float]) -> None:
     """They are those of the nearest contours, ties included; beyond the reach of contours they do not matter."""
     labels = random_labels(*shape, regions=6, grain=7)
@@ -141,7 +140,7 @@ def test_widths_of_pixels(shape: tuple[int, int, int], values: list[float]) -> N
     assert torch.equal(pixels[~is_far], expected[~is_far])
 
 
-@pytest.mark.parametrize("softness", [0.0, 0.7, pairs(4, [0.5, 0.0, 2.0])])
+@pytest.mark.parametrize("softness", [0.7, pairs(4, [0.5, 0.0, 2.0])])
 def test_devices_agree(softness: Widths, device: torch.device) -> None:
     membership, moved = (membership_of(MAPS["batch"].to(d), softness) for d in ("cpu", device))
     tiles, pixels = moved.tiled_table.tiles, moved.table.width_index
@@ -150,7 +149,7 @@ def test_devices_agree(softness: Widths, device: torch.device) -> None:
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-@pytest.mark.parametrize("softness", [0.0, 0.7, pairs(4, [0.5, 0.0, 2.0])])
+@pytest.mark.parametrize("softness", [0.7, pairs(4, [0.5, 0.0, 2.0])])
 def test_waits_for_the_device(softness: Widths) -> None:
     labels = MAPS["batch"].cuda()
     with warnings.catch_warnings(record=True) as waits:

@@ -34,13 +34,12 @@ def launches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return counts
 
 
-def field_of(kind: str, num_gaussians: int = 20) -> GaussianField:
-    channels = 5 if kind == "channels" else 3
-    field = GaussianField.random(num_gaussians, SIZE, channels=channels, seed=1)
+def field_of(kind: str) -> GaussianField:
+    field = GaussianField.random(20, SIZE, channels=5 if kind == "batch" else 3, seed=1)
     tensors = [field.means.detach(), field.cholesky.detach(), field.colors.detach()]
     if kind == "batch":
         tensors = [torch.stack([tensor, 0.9 * tensor]) for tensor in tensors]
-    opacities = torch.full((num_gaussians,), 0.7) if kind == "opacities" else None
+    opacities = torch.full((20,), 0.7) if kind == "opacities" else None
     field = GaussianField(*tensors, None, opacities, size=SIZE)
     if kind == "frozen":
         field.cholesky.requires_grad_(False)
@@ -60,7 +59,7 @@ def states(optimizer: GaussianAdam) -> list[Tensor]:
     return [values for state in optimizer.state.values() for values in state.values()]
 
 
-@pytest.mark.parametrize("kind", ["plain", "channels", "opacities", "batch", "frozen", "bounded"])
+@pytest.mark.parametrize("kind", ["opacities", "batch", "frozen", "bounded"])
 def test_takes_the_steps_of_torch_operations(kind: str, launches: list[int]) -> None:
     """In float32 and in float64, of rows that are of two ages, reach the bounds, and have NaN at times."""
     field, generator = field_of(kind), torch.Generator().manual_seed(2)
@@ -68,14 +67,12 @@ def test_takes_the_steps_of_torch_operations(kind: str, launches: list[int]) -> 
     settings: dict[str, Any] = {"min_sigma": 2.0, "bounded": kind == "bounded"}
     optimizers = [GaussianAdam(each, 0.5, **settings) for each in (field, twin)]
     for step in range(4):
-        if step == 1:
-            for each, optimizer in zip((field, twin), optimizers, strict=True):
+        for each, optimizer in zip((field, twin), optimizers, strict=True):
+            if step == 1:
                 optimizer.append(each, copy.deepcopy(each))
-        if step == 2:
-            for each, optimizer in zip((field, twin), optimizers, strict=True):
-                optimizer.freeze(
-                    each, (torch.arange(each.num_gaussians, device=DEVICE) == 5).expand(each.means.shape[:-1])
-                )
+            if step == 2:
+                rows_of_field = torch.arange(each.num_gaussians, device=DEVICE)
+                optimizer.freeze(each, (rows_of_field == 5).expand(each.means.shape[:-1]))
         give_gradients(generator, field, twin)
         rows = [0, 7, 19] + [5] * (step >= 2)
         for each in (field, twin):

