@@ -89,8 +89,8 @@ class TestRegionSplat(BaseTester):
         assert image.dtype == dtype and image.device.type == device.type
         assert image.isfinite().all() and image.any()
 
-    @pytest.mark.parametrize("lead", [(), (1,), (3,)])
-    @pytest.mark.parametrize(("count", "channels"), [(0, 3), (1, 1), (7, 5)])
+    @pytest.mark.parametrize("lead", [(), (3,)])
+    @pytest.mark.parametrize(("count", "channels"), [(0, 3), (7, 5)])
     def test_cardinality(
         self, backend: str, device: torch.device, dtype: torch.dtype, lead: tuple[int, ...], count: int, channels: int
     ) -> None:
@@ -191,17 +191,18 @@ class TestRegionSplat(BaseTester):
         torch.testing.assert_close(image[0, 0], torch.tensor(share), rtol=0, atol=1e-6)
         assert share[0] == 1.0 and share[5] == 0.0 and 0.5 < share[2] < 1.0
 
-    @pytest.mark.parametrize("softness", [0.0, 0.8])
-    @pytest.mark.parametrize("regions", [1, 3])
-    @pytest.mark.parametrize("backend", ["reference", "tiled"])
+    @pytest.mark.parametrize(
+        ("backend", "regions", "softness"),
+        [("reference", 1, 0.0), ("reference", 3, 0.0), ("reference", 3, 0.8), ("tiled", 3, 0.8)],
+    )
     def test_gradcheck(self, backend: str, regions: int, softness: float) -> None:
-        scene = random_scene(5, (9, 19), regions, channels=2)
+        scene = random_scene(3, (9, 19), regions, channels=2)
         region_map = RegionMap(scene.labels, softness)
 
         def render(means: Tensor, cholesky: Tensor, colors: Tensor) -> Tensor:
             return region_splat(means, cholesky, colors, scene.region_ids, region_map, cutoff=0, backend=backend)
 
-        self.gradcheck(render, scene[:3], fast_mode=(backend, regions, softness) != ("tiled", 3, 0.8))
+        self.gradcheck(render, scene[:3], fast_mode=backend != "tiled")
 
     def test_gradients_of_one_argument(self, backend: str) -> None:
         scene = suited(random_scene(20, (20, 30), 2), backend)
@@ -222,24 +223,22 @@ class TestRegionSplat(BaseTester):
         expected = region_splat(*(t.to(image.dtype) for t in scene[:3]), *scene[3:], cutoff=1e-3, backend=backend)
         assert expected.any() and torch.equal(image, expected)
 
-    @pytest.mark.parametrize("softness", [0.0, 0.8])
-    def test_dynamo(self, backend: str, device: torch.device, dtype: torch.dtype, softness: float) -> None:
+    def test_dynamo(self, device: torch.device, dtype: torch.dtype) -> None:
         scene = on(device, dtype, random_scene(12, (9, 17), 3))
-        regions = RegionMap(scene.labels, softness)
+        regions = RegionMap(scene.labels, 0.8)
         leaves = [t.requires_grad_() for t in scene[:3]]
 
         def render(*tensors: Tensor) -> Tensor:
-            return region_splat(*tensors, scene.region_ids, regions, backend=backend)
+            return region_splat(*tensors, scene.region_ids, regions)
 
         self.assert_compiles(render, *leaves, leaves=leaves, backend="aot_eager")
 
 
-SIZES = [(1, 1), (1, 700), (33, 16), (47, 61)]
-
-
 class TestAgainstReference:
-    @pytest.mark.parametrize(("regions", "softness"), [(1, 0.0), (5, 0.0), (5, 0.7), (5, 3.0)])
-    @pytest.mark.parametrize("size", SIZES)
+    @pytest.mark.parametrize(
+        ("size", "regions", "softness"),
+        [((1, 1), 1, 0.0), ((1, 700), 5, 0.7), ((33, 16), 5, 0.0), ((47, 61), 1, 0.0), ((47, 61), 5, 3.0)],
+    )
     def test_cutoff_zero(self, backend: str, size: tuple[int, int], regions: int, softness: float) -> None:
         scene = random_scene(60, size, regions)
         region_map = RegionMap(scene.labels, softness)
@@ -275,7 +274,7 @@ class TestAgainstReference:
         assert error <= 3.2e-4 and (backend != "cpu" or error > 1.6e-4)
 
     @pytest.mark.parametrize(
-        ("count", "size", "channels"), [(3000, (16, 16), 3), *[(40, (20, 30), n) for n in (1, 2, 4, 9, 32)]]
+        ("count", "size", "channels"), [(3000, (16, 16), 3), (40, (20, 30), 1), (40, (20, 30), 9)]
     )
     def test_channels_and_long_lists(self, backend: str, count: int, size: tuple[int, int], channels: int) -> None:
         """3000 Gaussians of one tile are more than a segment of the kernels' lists."""
@@ -322,7 +321,7 @@ class TestConventions:
         image.sum().backward()
         assert empty[0].grad is None or empty[0].grad.shape == (0, 2)
 
-    @pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.uint16, torch.uint32])
+    @pytest.mark.parametrize("dtype", [torch.uint8, torch.uint32])
     def test_integer_dtypes_of_ids(self, backend: str, dtype: torch.dtype) -> None:
         scene = as_float32(random_scene(20, (20, 30), 2))
         image = region_splat(*scene[:3], scene.region_ids.to(dtype), scene.labels.to(dtype), backend=backend)

@@ -33,7 +33,7 @@ assert not {"torch", "kcgs"} & set(sys.modules)
 """
 ROOT = Path(kcgs.__file__).resolve().parent.parent
 SIZE = (24, 32)
-BATCH = 6
+BATCH = 4
 
 
 def draw_shapes(seed: int, batch: int = BATCH) -> tuple[Tensor, Tensor]:
@@ -136,7 +136,7 @@ class TestOneGraph:
             counter = torch._dynamo.testing.CompileCounterWithBackend(name or "eager")
             step_loss = torch.compile(batch_loss, fullgraph=True, backend=counter) if name else batch_loss
             losses = []
-            for step in range(6):
+            for step in range(4):
                 loss = step_loss(*draw_shapes(step % 2))
                 optimizer.zero_grad()
                 loss.backward()
