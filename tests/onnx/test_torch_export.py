@@ -55,15 +55,13 @@ def assert_close(image: Tensor, expected: Tensor, error: float = 1e-5) -> None:
 
 @pytest.mark.filterwarnings("ignore:.* Gaussians paint nothing:UserWarning")
 class TestDecomposition:
-    @pytest.mark.parametrize("size", [SIZE, (77, 101), (33, 41)])
-    @pytest.mark.parametrize("softness", [0.0, 0.7, PAIRS])
-    def test_maps(self, softness: Any, size: tuple[int, int]) -> None:
+    @pytest.mark.parametrize(("size", "softness"), [(SIZE, 0.7), ((77, 101), PAIRS), ((33, 41), 0.0)])
+    def test_maps(self, size: tuple[int, int], softness: Any) -> None:
         regions = RegionMap(labels_of(SIZE), softness)
         args = (*gaussians(2, 30, size), *table_and_size(regions)[0], *size, 1e-4, "reference")
         assert_close(decompose(*args), torch.ops.kcgs.region_splat(*args))
 
-    @pytest.mark.parametrize("cutoff", [0.0, 1e-2])
-    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    @pytest.mark.parametrize(("cutoff", "dtype"), [(0.0, torch.float64), (1e-2, torch.float32)])
     def test_without_a_map(self, cutoff: float, dtype: torch.dtype) -> None:
         tensors = [t.to(dtype) for t in gaussians(2, 30, SIZE)[:3]]
         args = (*tensors, *[None] * (1 + len(MapTable._fields)), *SIZE, cutoff, "reference")
