@@ -28,7 +28,6 @@ if not (DOCS / "conf.py").is_file():
 @pytest.fixture(scope="module")
 def generate() -> ModuleType:
     spec = importlib.util.spec_from_file_location("kcgs_docs_generate", DOCS / "generate.py")
-    assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

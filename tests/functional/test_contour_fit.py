@@ -137,7 +137,7 @@ class TestChooseSoftness:
     )
     def test_exception(self, change: dict[str, object], error: type[Exception], words: str) -> None:
         with pytest.raises(error, match=words):
-            choose_softness(**{"image": torch.zeros(3, 4, 4), "labels": ONE, **change})  # type: ignore[arg-type]
+            choose_softness(**{"image": torch.zeros(3, 4, 4), "labels": ONE, **change})
 
 
 class TestContourGain:
@@ -156,7 +156,7 @@ class TestContourGain:
     @pytest.mark.parametrize("function", [choose_softness, contour_gain])
     def test_one_region(self, function: object) -> None:
         for size in ((9, 7), (1, 1)):
-            assert function(torch.rand(3, *size), torch.full(size, 3)) == {}  # type: ignore[operator]
+            assert function(torch.rand(3, *size), torch.full(size, 3)) == {}
 
     def test_a_contour_against_a_displaced_one(self, data_root: Path) -> None:
         image, labels = frame(data_root, "blackswan")

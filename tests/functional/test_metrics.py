@@ -351,7 +351,7 @@ class _MetaDevice(Tensor):
     """A finite tensor whose device is not the CPU, which every machine has: a subclass that says so."""
 
     @property
-    def device(self) -> torch.device:  # type: ignore[override]
+    def device(self) -> torch.device:
         return torch.device("meta")
 
 
@@ -402,6 +402,6 @@ class TestLargeImages:
         images = torch.rand(2, 3, 1200, 1700)
         with torch.profiler.profile(profile_memory=True) as profile:
             ssim(*images)
-        events = profile.profiler.kineto_results.events()  # type: ignore[union-attr]
+        events = profile.profiler.kineto_results.events()
         peak = max(itertools.accumulate(event.nbytes() for event in events if event.name() == "[memory]"))
         assert 0 < peak < 4 * images.nbytes

@@ -48,7 +48,7 @@ class TestGaussianField(BaseTester):
         assert field.num_gaussians == count and field.merged_colors().shape == (*lead, count, channels)
         assert field.means.dtype == whole(dtype) and field.size == SIZE
         labels = torch.zeros(*lead, *SIZE, device=device, dtype=torch.long)
-        assert field.assign_regions(labels).region_ids.shape == (*lead, count)  # type: ignore[union-attr]
+        assert field.assign_regions(labels).region_ids.shape == (*lead, count)
         one = field[0] if lead else field
         assert one.means.shape == (count, 2) and one.subset(torch.arange(count)).num_gaussians == count
 
@@ -96,12 +96,11 @@ class TestGaussianField(BaseTester):
     def test_half_is_refused_aloud(self, field: GaussianField, move: object) -> None:
         before = field.means.detach().clone()
         with pytest.warns(UserWarning, match="stays in float32"):
-            move(field)  # type: ignore[operator]
+            move(field)
         assert field.means.dtype == field.colors.dtype == torch.float32
         assert torch.equal(field.means, before)
 
     def test_subset(self, field: GaussianField, labels: Tensor) -> None:
-        assert field.region_ids is not None
         inside = field.region_ids == 4
         part, rest = field.subset(inside), field.subset((~inside).nonzero().flatten())
         assert part.num_gaussians + rest.num_gaussians == 60 and 0 < part.num_gaussians < 60
@@ -149,7 +148,6 @@ class TestGaussianField(BaseTester):
         image = RegionSplatRenderer()(with_alpha, labels)
         torch.testing.assert_close(image, RegionSplatRenderer()(merged, labels))
         image.sum().backward()
-        assert with_alpha.opacities is not None and with_alpha.opacities.grad is not None
         assert with_alpha.opacities.grad.abs().max() > 0
 
     @pytest.mark.parametrize(
@@ -298,7 +296,6 @@ class TestBatch:
         parts = [GaussianField.random(30, SIZE, regions=labels, seed=k) for k, labels in enumerate(maps)]
         leaves = [torch.stack([getattr(f, name).detach() for f in parts]) for name in ("means", "cholesky", "colors")]
         batch = GaussianField(*leaves, size=SIZE).assign_regions(regions)
-        assert batch.region_ids is not None
         assert [tuple(row.unique().tolist()) for row in batch.region_ids] == [tuple(sorted(ids)) for ids in self.IDS]
         render = RegionSplatRenderer(backend=backend)
         images = render(batch, regions, size)

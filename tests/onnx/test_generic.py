@@ -33,7 +33,6 @@ def session(cutoff: float = 1e-4, clamp: bool = False) -> onnxruntime.InferenceS
 
 
 def feeds_of(field: GaussianField, regions: RegionMap) -> dict[str, np.ndarray]:
-    assert field.region_ids is not None
     tensors = {"means": field.means, "cholesky": field.cholesky, "colors": field.merged_colors()}
     tensors["memberships"] = torch.stack([regions.membership(region) for region in regions.ids.tolist()])
     return {

@@ -196,7 +196,6 @@ class TestInteractive:
     def test_view_and_visible(self, kind: str, grids: bool) -> None:
         scene = with_regions(kind, 80, (80, 112), 5)
         decoder, render = Interactive(scene), RegionSplatRenderer()
-        assert scene.regions is not None
         with torch.no_grad():
             large = render(scene.field, scene.regions, (320, 448))
             part = decoder.render((50, 100), [10, 7, 35, 19.5])  # at the same scale, across tiles
@@ -211,7 +210,6 @@ class TestInteractive:
         size, pad = (48, 64), 64
         scene = with_regions(kind, 60, size, 5)
         field, regions = scene.field, scene.regions
-        assert regions is not None and field.region_ids is not None
         shares = [membership_at(*table_and_size(regions)).weights(0, r, torch.float64) for r in range(5)]
         shares = [torch.nn.functional.pad(s[None, None], (pad,) * 4, mode="replicate")[0, 0] for s in shares]
         padded = shares[0].shape

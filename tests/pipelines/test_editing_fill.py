@@ -85,7 +85,6 @@ def move(scene: Scene, region: int) -> Scene:
 
 def test_move_fills_what_it_uncovers(scene: Scene) -> None:
     moved = move_region(scene, 1, (9, 0))
-    assert moved.regions is not None
     landed = moved.regions.labels == 1
     today = move_region(scene, 1, (9, 0), fill=False)
     torch.testing.assert_close(moved()[:, landed], today()[:, landed], rtol=0, atol=1e-5)

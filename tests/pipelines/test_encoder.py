@@ -1,16 +1,13 @@
-"""An encoder: a network that predicts the Gaussians of a batch of images, trained, compiled and exported."""
+"""An encoder: a network that predicts the Gaussians of a batch of images, trained and compiled."""
 
 from __future__ import annotations
 
 import inspect
 import json
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import kornia
-import numpy as np
 import pytest
 import torch
 import torch._dynamo.testing
@@ -21,35 +18,25 @@ import kcgs
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer
 from kcgs.functional import activate_gaussians, edge_band, lookup_regions, region_splat
 
-# run by a process of its own
-RUN = """
-import sys
-import numpy as np
-import onnxruntime
-
-session = onnxruntime.InferenceSession("encoder.onnx")
-np.save("renders.npy", session.run(None, dict(np.load("inputs.npz")))[0])
-assert not {"torch", "kcgs"} & set(sys.modules)
-"""
 ROOT = Path(kcgs.__file__).resolve().parent.parent
 SIZE = (24, 32)
 BATCH = 4
 
 
-def draw_shapes(seed: int, batch: int = BATCH) -> tuple[Tensor, Tensor]:
+def draw_shapes(seed: int) -> tuple[Tensor, Tensor]:
     """Draw a coloured disc on a shaded ground of another colour, (B, 3, H, W), and the label maps, (B, H, W).
 
     Every second image has a third region, of another id for each, in a corner.
     """
     generator = torch.Generator().manual_seed(seed)
-    draw = torch.rand(batch, 10, generator=generator)
+    draw = torch.rand(BATCH, 10, generator=generator)
     y, x = torch.meshgrid(*(torch.arange(n) + 0.5 for n in SIZE), indexing="ij")
     center_x, center_y = (8 + 16 * draw[:, 0])[:, None, None], (8 + 8 * draw[:, 1])[:, None, None]
     inside = (x - center_x) ** 2 + (y - center_y) ** 2 < (4 + 3 * draw[:, 2])[:, None, None] ** 2
     ground = draw[:, 3:6, None, None] * (0.5 + 0.5 * x / SIZE[1])
     images, labels = torch.where(inside[:, None], draw[:, 6:9, None, None], ground), inside.long()
     images[::2, :, :8, :8] = draw[::2, 9, None, None, None]
-    labels[::2, :8, :8] = 2 + torch.arange(0, batch, 2)[:, None, None]
+    labels[::2, :8, :8] = 2 + torch.arange(0, BATCH, 2)[:, None, None]
     return images, labels
 
 
@@ -112,7 +99,7 @@ def test_trains_through_the_renderer() -> None:
 
 
 class TestOneGraph:
-    """Network, renderer and Kornia's loss in one graph, and the network as a program."""
+    """Network, renderer and Kornia's loss in one graph."""
 
     @pytest.fixture(autouse=True)
     def fresh(self) -> Iterator[None]:
@@ -155,8 +142,7 @@ class TestOneGraph:
 
         def render(images: Tensor, labels: Tensor) -> Tensor:
             field = GaussianField(*encoder.predict(images, labels)[:3], size=SIZE).assign_regions(labels)
-            image: Tensor = RegionSplatRenderer()(field, labels)
-            return image
+            return RegionSplatRenderer()(field, labels)
 
         compiled, (images, labels) = torch.compile(render, fullgraph=True, backend="eager"), draw_shapes(0)
         assert torch.equal(compiled(images, labels), encoder(images, labels))
@@ -164,21 +150,3 @@ class TestOneGraph:
             compiled(images * torch.nan, labels)
         with pytest.raises(RuntimeError, match="labels must hold non-negative ids"):
             compiled(images, labels - 1)
-
-    @pytest.mark.slow
-    @pytest.mark.filterwarnings(
-        "ignore:.*:DeprecationWarning", "ignore:.*:FutureWarning", "ignore:.*:UserWarning:torch"
-    )
-    def test_runs_without_torch(self, tmp_path: Path) -> None:
-        """As one ONNX file, over another number of images than was traced."""
-        torch.manual_seed(0)
-        encoder = Encoder().eval()
-        shapes = {0: "B"}, {0: "B"}
-        program = torch.onnx.export(encoder, draw_shapes(0, batch=2), dynamo=True, dynamic_shapes=shapes, verbose=False)
-        assert program is not None
-        program.save(tmp_path / "encoder.onnx")
-        images, labels = draw_shapes(1, batch=5)
-        np.savez(tmp_path / "inputs.npz", images=images.numpy(), labels=labels.numpy())
-        subprocess.run([sys.executable, "-c", RUN], cwd=tmp_path, check=True)
-        renders = torch.from_numpy(np.load(tmp_path / "renders.npy"))
-        torch.testing.assert_close(renders, encoder(images, labels).detach(), rtol=0, atol=1e-5)
