@@ -114,11 +114,10 @@ class TestChooseSoftness:
         monkeypatch.setattr(contour_windows, "_PAIR_WINDOWS", 10)
         assert choose_softness(paint(ellipse(), 1.0), ellipse()) == {(0, 1): pytest.approx(1.0, abs=0.1)}
 
-    @pytest.mark.parametrize(("name", "low", "high"), [("dog", 1.2, 1.6), ("blackswan", 0.7, 1.0)])
-    def test_photos(self, data_root: Path, name: str, low: float, high: float) -> None:
+    def test_a_photo(self, data_root: Path) -> None:
         # 400 Gaussians fitted to a crop at eight fixed values are best along the contour within these, over two seeds
-        (softness,) = choose_softness(*frame(data_root, name)).values()
-        assert low <= softness <= high
+        (softness,) = choose_softness(*frame(data_root, "dog")).values()
+        assert 1.2 <= softness <= 1.6
 
     @pytest.mark.parametrize(
         ("change", "error", "words"),

@@ -79,17 +79,6 @@ class TestDecomposition:
         args = (*gaussians(1, 0, SIZE), *MapTable(labels_of(SIZE)), *SIZE, 1e-4, "reference")
         assert torch.equal(decompose(*args), torch.zeros(1, 3, *SIZE))
 
-    def test_many_pairs(self) -> None:
-        """Nearest contours, equal distances among them, are those of scipy's distance transform."""
-        labels = torch.arange(24)[:, None] // 5 * 8 + torch.arange(36) // 5
-        pairs = {(a, b): 0.3 + (7 * a + 3 * b) % 5 / 4 for a in range(40) for b in range(a + 1, 40) if (a + b) % 3}
-        ids = set(labels.unique().tolist())
-        regions = RegionMap(labels, {p: w for p, w in pairs.items() if set(p) <= ids})
-        means, cholesky, colors, _ = gaussians(1, 40, (24, 36))
-        tensors = means, 3 * cholesky, colors, torch.arange(40)[None]
-        args = (*tensors, *table_and_size(regions)[0], 24, 36, 1e-4, "reference")
-        assert_close(decompose(*args), torch.ops.kcgs.region_splat(*args))
-
     def test_memory_is_that_of_a_chunk_and_the_image(self, monkeypatch: pytest.MonkeyPatch) -> None:
         loops = torch.ops.higher_order
         monkeypatch.setattr(loops, "scan", lambda body, carry, xs, inputs: generic_scan(body, carry, xs, 0, inputs))
@@ -108,15 +97,6 @@ class TestDecomposition:
         with largest:
             decompose(*tensors, *MapTable(labels_of(size)), *size, 1e-4, "tiled")
         assert largest.numel == 64 * 32 * 32 > 3 * 96 * 128
-
-    def test_compilers_and_torch_export_keep_the_operator(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        operator = torch.ops.kcgs.region_splat.default
-        monkeypatch.setitem(torch._decomp.decomposition_table, operator, None)  # not to be called
-        tensors = [t[0] for t in gaussians(1, 12, SIZE)]
-        torch._dynamo.reset()
-        compiled = torch.compile(region_splat, backend="aot_eager", fullgraph=True, dynamic=True)
-        assert_close(compiled(*tensors, labels_of(SIZE)), region_splat(*tensors, labels_of(SIZE)))
-
 
 class Predictor(nn.Module):
     """A network that predicts Gaussians, the renderer, and a filter of Kornia."""
