@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import inspect
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,11 +12,10 @@ import pytest
 import torch
 import torch._dynamo.testing
 from torch import Tensor, nn
-from torch.nn import functional
 
 import kcgs
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer
-from kcgs.functional import activate_gaussians, edge_band, lookup_regions, region_splat
+from kcgs.functional import region_splat
 
 ROOT = Path(kcgs.__file__).resolve().parent.parent
 SIZE = (24, 32)
@@ -40,41 +39,17 @@ def draw_shapes(seed: int) -> tuple[Tensor, Tensor]:
     return images, labels
 
 
-class Encoder(nn.Module):
-    """Images (B, 3, H, W) and label maps (B, H, W) to images of Gaussians, one for each cell."""
-
-    cell = 4
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.net = nn.Sequential(
-            nn.Conv2d(4, 32, 3, stride=2, padding=1), nn.GELU(),
-            nn.Conv2d(32, 64, 3, stride=2, padding=1), nn.GELU(),
-            nn.Conv2d(64, 64, 3, padding=1), nn.GELU(),
-            nn.Conv2d(64, 8, 1),
-        )  # fmt: skip
-
-    def predict(self, images: Tensor, labels: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return means, factors, colours and region ids of a batch."""
-        contours = edge_band(labels, width=1)[:, None].to(images)
-        raw = self.net(torch.cat([images, contours], 1)).flatten(2).mT  # [B, N, 8], any real numbers
-        height, width = images.shape[-2:]
-        cells = kornia.geometry.create_meshgrid(height // self.cell, width // self.cell, False).flatten(0, 2)
-        means, cholesky, colors = activate_gaussians(raw, (cells + 0.5) * self.cell, self.cell)
-        colors = colors + 0.6 * functional.avg_pool2d(images, self.cell).flatten(2).mT
-        return means, cholesky, colors, lookup_regions(means, labels)
-
-    def forward(self, images: Tensor, labels: Tensor) -> Tensor:
-        """Predict and render."""
-        return region_splat(*self.predict(images, labels), labels)
+PAGE = (ROOT / "docs/kornia.md").read_text(encoding="utf-8")
+BLOCK = re.search(r"^from kcgs[^`]*^class Encoder[^`]*", PAGE, re.MULTILINE)[0]
+NAMES = {"kornia": kornia, "torch": torch, "nn": nn, "functional": nn.functional, "Tensor": Tensor}
+exec(BLOCK, NAMES)
+Encoder = NAMES["Encoder"]
 
 
-@pytest.mark.parametrize("page", ["notebooks/06_differentiable_layer.ipynb", "docs/kornia.md"])
-def test_is_the_one_that_people_start_from(page: str) -> None:
-    text = (ROOT / page).read_text(encoding="utf-8")
-    if page.endswith("ipynb"):
-        text = "\n".join("".join(cell["source"]) for cell in json.loads(text)["cells"])
-    assert inspect.getsource(Encoder) in text
+def test_is_that_of_the_tutorial() -> None:
+    notebook = json.loads((ROOT / "notebooks/06_differentiable_layer.ipynb").read_text(encoding="utf-8"))
+    text = "\n".join("".join(cell["source"]) for cell in notebook["cells"])
+    assert BLOCK[BLOCK.index("class Encoder") :] in text
 
 
 def test_trains_through_the_renderer() -> None:
