@@ -12,9 +12,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene
+from kcgs import GaussianField, RegionMap, Scene
 
-SIZE = (20, 30)
 TARGETS = (0.2, 0.8)
 PATIENCE = timedelta(minutes=5)  # of processes that wait for one another
 UNREACHABLE = 77  # exit status, as of a skipped test in automake
@@ -26,12 +25,12 @@ class Toned(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         torch.manual_seed(0)
-        regions = RegionMap((torch.arange(SIZE[1]) // 11).expand(SIZE), 0.8)
-        self.scene = Scene(GaussianField.random(40, SIZE, regions=regions, seed=0), regions)
-        self.render, self.tone = RegionSplatRenderer(), nn.Conv2d(3, 3, 1)
+        regions = RegionMap((torch.arange(30) // 11).expand(20, 30), 0.8)
+        self.scene = Scene(GaussianField.random(40, regions.size, regions=regions, seed=0), regions)
+        self.tone = nn.Conv2d(3, 3, 1)
 
-    def forward(self, exposure: Tensor) -> Tensor:
-        return self.tone(exposure * self.render(self.scene)[None])
+    def forward(self) -> Tensor:
+        return self.tone(self.scene()[None])
 
 
 def train(module: nn.Module, targets: tuple[float, ...]) -> dict[str, Tensor]:
@@ -39,7 +38,7 @@ def train(module: nn.Module, targets: tuple[float, ...]) -> dict[str, Tensor]:
     optimizer = torch.optim.SGD(module.parameters(), lr=0.5)
     for _ in range(3):
         optimizer.zero_grad()
-        image = module(torch.ones(1))
+        image = module()
         torch.stack([(image - target).square().mean() for target in targets]).mean().backward()
         optimizer.step()
     return {name: p.detach() for name, p in module.named_parameters()}
@@ -80,7 +79,7 @@ def test_trains_as_one_process_does(tmp_path: Path) -> None:
 if __name__ == "__main__":
     import torch._dynamo  # by optimizers
 
-    Toned()(torch.ones(1))  # kernels, too, are loaded once for both processes
+    Toned()()  # kernels, too, are loaded once for both processes
     child = os.fork()
     status = train_as(0 if child else 1, Path(sys.argv[1]))
     if child:

@@ -84,7 +84,7 @@ class TestGaussianField(BaseTester):
         assert other.cholesky is field.cholesky and other.colors is colors and other.means is not means
         assert {name for name, _ in other.named_buffers()} == {"colors", "region_ids"}
         other.double()
-        assert other.region_ids is not None and other.region_ids.dtype == torch.int64
+        assert other.region_ids.dtype == torch.int64
         assert RegionSplatRenderer()(other, labels).dtype == torch.float64 and means.dtype == torch.float32
 
     def test_random_is_seeded(self) -> None:
@@ -92,11 +92,10 @@ class TestGaussianField(BaseTester):
         assert torch.equal(a.means, b.means) and torch.equal(a.colors, b.colors)
         assert not torch.equal(a.means, GaussianField.random(10, SIZE, seed=4).means)
 
-    @pytest.mark.parametrize("move", [lambda f: f.bfloat16(), lambda f: f.to(torch.float16)])
-    def test_half_is_refused_aloud(self, field: GaussianField, move: object) -> None:
+    def test_half_is_refused_aloud(self, field: GaussianField) -> None:
         before = field.means.detach().clone()
         with pytest.warns(UserWarning, match="stays in float32"):
-            move(field)
+            field.bfloat16()
         assert field.means.dtype == field.colors.dtype == torch.float32
         assert torch.equal(field.means, before)
 
@@ -126,9 +125,6 @@ class TestGaussianField(BaseTester):
             ([], ValueError, "fields must hold at least one; got none"),
             ([nn.Linear(2, 3)], TypeError, "fields must be GaussianFields; got Linear"),
             ([GaussianField.random(60, SIZE), GaussianField.random(59, SIZE)], ValueError, "alike.* 60 .*got .* 59 "),
-            ([GaussianField.random(9, SIZE), GaussianField.random(9, (24, 35))], ValueError, r"alike.*got .*24, 35"),
-            ([GaussianField.random(9, SIZE, regions=torch.ones(SIZE).long()), GaussianField.random(9, SIZE)],
-             ValueError, "with 9 Gaussians.* confined.*got .* not confined"),
             ([GaussianField.stack([GaussianField.random(9, SIZE)])], ValueError, "one image each.*got one with 1 x 9"),
         ],
     )  # fmt: skip
@@ -147,8 +143,6 @@ class TestGaussianField(BaseTester):
         )
         image = RegionSplatRenderer()(with_alpha, labels)
         torch.testing.assert_close(image, RegionSplatRenderer()(merged, labels))
-        image.sum().backward()
-        assert with_alpha.opacities.grad.abs().max() > 0
 
     @pytest.mark.parametrize(
         ("change", "error", "words"),
