@@ -18,7 +18,6 @@ from kcgs.functional import region_splat
 from kcgs.maps import membership_at, table_and_size
 from kcgs.onnx import describe_decoder, plan, scene_decoder
 
-SIZE = (37, 53)
 PAIRS = {(2, 5): 0.0, (5, 8): 1.7, (2, 11): 0.6}
 WIDE_PAIRS = {(2, 5): 5.0, (5, 8): 0.4}
 SOFTNESS: dict[str, Any] = {"hard": 0.0, "soft": 0.8, "pairs": PAIRS, "wide": 6.0, "wide-pairs": WIDE_PAIRS}
@@ -133,23 +132,20 @@ def grids(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bo
     return bool(request.param)
 
 
-def kinds_and_grids(*rows: tuple[str, bool]) -> pytest.MarkDecorator:
-    return pytest.mark.parametrize(("kind", "grids"), rows, indirect=["grids"])
-
-
 class TestImage:
-    @kinds_and_grids(
-        ("none", False), ("none", True), ("hard", False), ("soft", True), ("pairs", False), ("wide", False),
-        ("wide-pairs", True),
+    @pytest.mark.parametrize(
+        ("kind", "grids", "cutoff"),
+        [
+            ("none", False, 1e-4), ("none", True, 1e-4), ("hard", False, 1e-6), ("soft", True, 1e-4),
+            ("pairs", False, 0.0), ("wide", False, 1e-4), ("wide-pairs", True, 1e-4),
+        ],
+        indirect=["grids"],
     )  # fmt: skip
-    def test_any_size(self, kind: str, grids: bool) -> None:
+    def test_any_size(self, kind: str, grids: bool, cutoff: float) -> None:
         scene = with_regions(kind, 60, (75, 101))
-        assert (plan.plan_decoder(scene.field, scene.regions, 1e-4).nodes is not None) == grids
-        assert_as_rendered(scene, [(150, 202), (1, 1), (5, 300)])
+        assert (plan.plan_decoder(scene.field, scene.regions, cutoff).nodes is not None) == grids
+        assert_as_rendered(scene, [(150, 202), (1, 1), (5, 300)], cutoff)
 
-    @pytest.mark.parametrize(("kind", "cutoff"), [("hard", 1e-6), ("pairs", 0.0)])
-    def test_cutoffs(self, kind: str, cutoff: float) -> None:
-        assert_as_rendered(with_regions(kind, 80, SIZE), [(74, 106), (20, 31)], cutoff)
 
     @pytest.mark.filterwarnings("ignore:.* Gaussians paint nothing")
     @pytest.mark.parametrize(
@@ -178,7 +174,7 @@ class TestImage:
         assert plain.min() < -0.1 and plain.max() > 1.1
         assert torch.equal(clipped, plain.clamp(0, 1))
 
-    @kinds_and_grids(("none", True), ("soft", True))
+    @pytest.mark.parametrize(("kind", "grids"), [("none", True), ("soft", True)], indirect=["grids"])
     def test_wide_gaussians_alone(self, kind: str, grids: bool) -> None:
         """No list of Gaussians is left for the pixels."""
         scene = only_wide(kind)
@@ -192,12 +188,12 @@ class TestImage:
 
 
 class TestInteractive:
-    @kinds_and_grids(("hard", False), ("soft", True))
+    @pytest.mark.parametrize(("kind", "grids"), [("hard", False), ("soft", True)], indirect=["grids"])
     def test_view_and_visible(self, kind: str, grids: bool) -> None:
         scene = with_regions(kind, 80, (80, 112), 5)
         decoder, render = Interactive(scene), RegionSplatRenderer()
         with torch.no_grad():
-            large = render(scene.field, scene.regions, (320, 448))
+            large = scene((320, 448))
             part = decoder.render((50, 100), [10, 7, 35, 19.5])  # at the same scale, across tiles
             assert (part - large[:, 28:78, 40:140]).abs().max() < 1e-3
             for hidden in range(5):
@@ -246,7 +242,7 @@ class TestModel:
     @pytest.mark.parametrize("interactive", [False, True])
     def test_every_constant_and_result_is_read(self, interactive: bool) -> None:
         """The runtime warns of others, at every load."""
-        graphs = [scene_decoder(with_regions("soft", 40, SIZE, 4), interactive=interactive).graph]
+        graphs = [scene_decoder(with_regions("soft", 40, (37, 53), 4), interactive=interactive).graph]
         read: set[str] = set()
         stored: set[str] = set()
         for graph in graphs:  # grows by the graphs inside
