@@ -378,7 +378,6 @@ def test_exception(image: Tensor, target: Tensor, error: type[Exception], words:
 class TestLargeImages:
     """Blocks of rows give what the whole image gives, in less memory."""
 
-
     def test_blocks_agree_with_the_whole(self, monkeypatch: pytest.MonkeyPatch) -> None:
         labels = (torch.arange(192) > 90).long().expand(176, 192)
         metrics = [ssim, ms_ssim, lambda image, target: ef_ssim(image, target, labels)]

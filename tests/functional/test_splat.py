@@ -262,9 +262,7 @@ class TestAgainstReference:
         error = (result - exact).abs().max()
         assert error <= 3.2e-4 and (backend != "cpu" or error > 1.6e-4)
 
-    @pytest.mark.parametrize(
-        ("count", "size", "channels"), [(3000, (16, 16), 3), (40, (20, 30), 1), (40, (20, 30), 9)]
-    )
+    @pytest.mark.parametrize(("count", "size", "channels"), [(3000, (16, 16), 3), (40, (20, 30), 1), (40, (20, 30), 9)])
     def test_channels_and_long_lists(self, backend: str, count: int, size: tuple[int, int], channels: int) -> None:
         """3000 Gaussians of one tile are more than a segment of the kernels' lists."""
         scene = random_scene(count, size, 3, channels=channels)

@@ -180,7 +180,6 @@ class TestRegionSplatRenderer(BaseTester, without=WITHOUT):
         field = GaussianField.random(count, SIZE, regions=labels, seed=0, dtype=whole(dtype))
         return Scene(field, labels).to(device)
 
-
     @pytest.mark.parametrize(
         ("lead", "keepdim", "size"), [((), True, None), ((), False, (10, 50)), ((2,), False, None)]
     )
@@ -211,7 +210,6 @@ class TestRegionSplatRenderer(BaseTester, without=WITHOUT):
         scene = Scene(scene.field.subset(torch.arange(scene.num_gaussians)))
         scene.field.region_ids = None
         self.assert_close(render(scene, size=(24, 108))[:, :, 1::3], render(scene), rtol=1e-4, atol=1e-5)
-
 
     def test_clamp(self, field: GaussianField, labels: Tensor) -> None:
         with torch.no_grad():

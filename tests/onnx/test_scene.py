@@ -146,7 +146,6 @@ class TestImage:
         assert (plan.plan_decoder(scene.field, scene.regions, cutoff).nodes is not None) == grids
         assert_as_rendered(scene, [(150, 202), (1, 1), (5, 300)], cutoff)
 
-
     @pytest.mark.filterwarnings("ignore:.* Gaussians paint nothing")
     @pytest.mark.parametrize(
         ("make", "size", "options"),

@@ -98,6 +98,7 @@ class TestDecomposition:
             decompose(*tensors, *MapTable(labels_of(size)), *size, 1e-4, "tiled")
         assert largest.numel == 64 * 32 * 32 > 3 * 96 * 128
 
+
 class Predictor(nn.Module):
     """A network that predicts Gaussians, the renderer, and a filter of Kornia."""
 

@@ -96,7 +96,6 @@ class TestEditing(BaseTester, without=WITHOUT):
         assert edited.size == edited.regions.size == SIZE and edited.metadata == {"title": "shapes"}
         assert torch.isin(edited.field.region_ids, edited.regions.ids).all()
 
-
     @pytest.mark.parametrize(
         ("edit", "error", "words"),
         [
@@ -177,6 +176,7 @@ class TestEditing(BaseTester, without=WITHOUT):
         edited().square().sum().backward()
         assert all(p.is_leaf and p.grad.any() for p in edited.parameters())
 
+
 class TestRenderRegion:
     @pytest.mark.parametrize(("kind", "size"), [("hard", None), ("soft", (30, 50)), ("pairs", (96, 128))])
     def test_all_regions_together_are_the_image(self, kind: str, size: tuple[int, int] | None) -> None:
@@ -221,6 +221,7 @@ class TestRenderRegion:
         expected = disc[:3] * disc[3] + box[:3] * box[3]
         torch.testing.assert_close(rgba[:3] * rgba[3], expected, rtol=0, atol=1e-5)
 
+
 class TestExtract:
     def test_only_the_region_is_left(self, regions: RegionMap) -> None:
         scene = scene_of(regions)
@@ -231,6 +232,7 @@ class TestExtract:
         assert alone.regions.num_regions == 3 and "3 regions, 2 of them without a Gaussian" in repr(alone)
         both = extract_region(scene, [DISC, BOX])
         assert set(both.field.region_ids.tolist()) == {BOX, DISC}
+
 
 class TestMove:
     def test_cut_out_is_shifted(self, regions: RegionMap) -> None:
@@ -271,8 +273,10 @@ class TestMove:
         moved = move_region(scene_of(MAPS["pairs"]), BOX, (20, 0), fill=False).regions
         assert moved.softness == {(GROUND, BOX): 1.0, (GROUND, DISC): 0.5, (BOX, DISC): 0.75}
 
+
 def luma(scene: Scene) -> Tensor:
     return torch.einsum("chw,c->hw", scene().detach(), torch.tensor([0.299, 0.587, 0.114]))
+
 
 class TestRecolor:
     @pytest.mark.parametrize(
@@ -349,6 +353,7 @@ class TestRecolor:
         assert (first - scene.render(RESIZED.size)).abs().max() > 0.1
         torch.testing.assert_close(second, first, rtol=0, atol=0.01)
 
+
 class TestDelete:
     def test_no_trace_of_the_colour(self, regions: RegionMap) -> None:
         """Only the box is red: without it nothing is."""
@@ -372,6 +377,7 @@ class TestDelete:
             assert result[y, x] in labels[tuple(stays[squared == squared.min()].T)]
         assert torch.equal(result[labels != 2], labels[labels != 2])
 
+
 class TestRenderOver:
     def test_shares_blend(self, regions: RegionMap) -> None:
         scene, background = scene_of(regions), torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(1))
@@ -384,6 +390,7 @@ class TestRenderOver:
         background = torch.rand(3, 100, 70, generator=torch.Generator().manual_seed(1))
         result = render_over(scene_of(regions), regions.ids.tolist(), background)
         torch.testing.assert_close(result, background, rtol=0, atol=1e-6)
+
 
 class TestReplaceBackground:
     @pytest.mark.parametrize("size", [SIZE, (30, 80)])
@@ -413,6 +420,7 @@ class TestReplaceBackground:
         first = DISC + 1
         assert isinstance(result, PairSoftness) and result[first, first + 1] == 1.5
         assert {value for pair, value in result.items() if max(pair) >= first > min(pair)} == {0.7}
+
 
 def grey() -> Scene:
     return Scene(GaussianField.random(3, SIZE, channels=1, seed=0))

@@ -159,7 +159,6 @@ def test_seams_are_where_layers_are_alike() -> None:
     assert (choose_layers(layers, costs, hole)[hole] == 2).all()
 
 
-
 def test_no_step_lowers_the_cost_of_a_choice_of_two() -> None:
     """Of two layers a cut finds the best choice: compared with all 64."""
     generator = torch.Generator().manual_seed(0)

@@ -139,7 +139,9 @@ class TestInvalidFields:
         for _ in range(2):
             optimizer.zero_grad()
             ((renderer(field) - image).square().mean() * float("nan")).backward()
-            with pytest.raises(ValueError, match=r"gradients must be finite; got \d+ NaN or infinite values: the loss,"):
+            with pytest.raises(
+                ValueError, match=r"gradients must be finite; got \d+ NaN or infinite values: the loss,"
+            ):
                 optimizer.step()
         assert torch.equal(field.means, before) and not optimizer.state
 
