@@ -13,7 +13,7 @@ from torch._higher_order_ops.while_loop import while_loop_dense
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from kcgs import GaussianField, RegionMap, Scene
-from kcgs.functional import edge_band, lookup_regions, region_splat
+from kcgs.functional import region_splat
 from kcgs.functional.decomposition import decompose
 from kcgs.maps import MapTable, table_and_size
 
@@ -110,10 +110,7 @@ class Predictor(nn.Module):
         self.blur = GaussianBlur2d((3, 3), (1.0, 1.0))
 
     def forward(self, means: Tensor, cholesky: Tensor, colors: Tensor, ids: Tensor, labels: Tensor) -> Tensor:
-        means = means + self.shift(means).tanh()
-        ids = torch.where(ids == 7, lookup_regions(means, labels), ids)
-        image = self.blur(region_splat(means, cholesky, colors, ids, labels))
-        return image + edge_band(labels, width=1)[:, None].to(image)
+        return self.blur(region_splat(means + self.shift(means).tanh(), cholesky, colors, ids, labels))
 
 
 class Resized(nn.Module):
