@@ -40,7 +40,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
         if importlib.util.find_spec(package) is None:
             pytest.skip("the site is built with the extra 'docs'")
     folder = tmp_path_factory.mktemp("site")
-    options = "-W --keep-going -q -D extensions=myst_nb,sphinx.ext.autodoc,sphinx.ext.napoleon".split()
+    options = ["-W", "--keep-going", "-q", "-D", "extensions=myst_nb,sphinx.ext.autodoc,sphinx.ext.napoleon"]
     command = [sys.executable, "-m", "sphinx", *options, "-d", str(folder / "doctrees")]
     build = subprocess.run([*command, str(DOCS), str(folder / "html")], capture_output=True, text=True, cwd=ROOT)
     assert build.returncode == 0, build.stdout + build.stderr
