@@ -35,9 +35,9 @@ def blocks(page: Path, language: str) -> list[str]:
 
 
 def python_blocks(page: Path) -> list[str]:
-    """Return the blocks of Python with fewer iterations: 20 where there are more."""
+    """Return the blocks of Python with fewer iterations: 15 where there are more."""
     return [
-        re.sub(r"\biterations=(\d+)", lambda match: f"iterations={min(int(match[1]), 20)}", block)
+        re.sub(r"\biterations=(\d+)", lambda match: f"iterations={min(int(match[1]), 15)}", block)
         for block in blocks(page, "python")
     ]
 

@@ -28,7 +28,6 @@ if not (DOCS / "conf.py").is_file():
 @pytest.fixture(scope="module")
 def generate() -> ModuleType:
     spec = importlib.util.spec_from_file_location("kcgs_docs_generate", DOCS / "generate.py")
-    assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -36,12 +35,13 @@ def generate() -> ModuleType:
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Build it as `make docs` does."""
-    for package in ("sphinx", "myst_nb", "furo", "sphinx_copybutton"):
+    """Build it as `make docs` does, without copies of the code and buttons to copy it."""
+    for package in ("sphinx", "myst_nb", "furo"):
         if importlib.util.find_spec(package) is None:
             pytest.skip("the site is built with the extra 'docs'")
     folder = tmp_path_factory.mktemp("site")
-    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-d", str(folder / "doctrees")]
+    options = ["-W", "--keep-going", "-q", "-D", "extensions=myst_nb,sphinx.ext.autodoc,sphinx.ext.napoleon"]
+    command = [sys.executable, "-m", "sphinx", *options, "-d", str(folder / "doctrees")]
     build = subprocess.run([*command, str(DOCS), str(folder / "html")], capture_output=True, text=True, cwd=ROOT)
     assert build.returncode == 0, build.stdout + build.stderr
     return folder / "html"

@@ -31,8 +31,7 @@ class TestActivateGaussians(BaseTester):
         assert all(bool(t.isfinite().all() and t.any()) for t in gaussians)
         assert {t.dtype for t in gaussians} == {torch.float64 if dtype == torch.float64 else torch.float32}
 
-    @pytest.mark.parametrize("lead", [(5,), (2, 5), (3, 2, 5)])
-    @pytest.mark.parametrize("channels", [1, 4])
+    @pytest.mark.parametrize(("lead", "channels"), [((5,), 1), ((3, 2, 5), 4)])
     def test_cardinality(self, lead: tuple[int, ...], channels: int) -> None:
         raw = sample(*lead, channels=channels)
         shapes = [tuple(t.shape) for t in activate_gaussians(raw, grid(5), SPACING)]
@@ -72,8 +71,7 @@ class TestActivateGaussians(BaseTester):
         )
         self.assert_close(colors, torch.full((5, 1), step, dtype=torch.float64))
 
-    @pytest.mark.parametrize("scale", [1.0, 1e2, 1e30])
-    @pytest.mark.parametrize("spacing", [0.5, 64.0])
+    @pytest.mark.parametrize(("scale", "spacing"), [(1.0, 0.5), (1e30, 64.0)])
     def test_any_numbers_are_valid(self, scale: float, spacing: float) -> None:
         """Within the documented ranges, however large the numbers are; a field takes them."""
         means, cholesky, colors = activate_gaussians(sample(200, scale=scale), grid(200), spacing)

@@ -61,7 +61,7 @@ class TestFunctionalConventions:
         self.assert_values(Scene(field).render()[0], [[1, 1.5 * ONE]])
         # metrics clip first: 0.5 against 1, 10 log10(4)
         half = torch.full_like(image, 0.5)
-        self.assert_values(psnr(half, image + 1), 6.0205999)  # type: ignore[arg-type]
+        self.assert_values(psnr(half, image + 1), 6.0205999)
 
     def test_convention_region_of_a_centre_is_the_floor(self) -> None:
         labels = torch.tensor([[3, 5], [7, 9]], device=self.device)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -42,7 +43,7 @@ class TestForms:
         torch.testing.assert_close(scales, expected)
         torch.testing.assert_close(scale_rotation_to_cholesky(scales, angle), factors)
 
-    @pytest.mark.parametrize("angle", [0.0, 1e-9, math.pi / 4, math.pi / 2, 2.0, math.pi])
+    @pytest.mark.parametrize("angle", [1e-9, math.pi / 2, 2.0])
     def test_needle_in_float32(self, angle: float) -> None:
         scales = torch.tensor([1e3, 1e-1])
         cholesky = scale_rotation_to_cholesky(scales, torch.tensor(angle))
@@ -53,7 +54,6 @@ class TestForms:
 
 
 class TestErrors:
-    @pytest.mark.parametrize("function", [cholesky_to_covariance, cholesky_to_scale_rotation])
     @pytest.mark.parametrize(
         ("value", "error", "words"),
         [
@@ -64,9 +64,9 @@ class TestErrors:
             (None, TypeError, "Tensor"),
         ],
     )
-    def test_cholesky(self, function: object, value: object, error: type[Exception], words: str) -> None:
+    def test_cholesky(self, value: Any, error: type[Exception], words: str) -> None:
         with pytest.raises(error, match=f"cholesky must.*{words}"):
-            function(value)  # type: ignore[operator]
+            cholesky_to_covariance(value)
 
     def test_covariance_not_positive(self) -> None:
         with pytest.raises(ValueError, match="covariance must be positive definite"):

@@ -125,17 +125,12 @@ class TestPsnr:
 
 
 class TestSsim:
-    @pytest.mark.parametrize("name", PHOTOS)
-    def test_matches_paper(self, name: str) -> None:
-        image, target = photo_pair(name)
+    def test_matches_paper(self) -> None:
+        image, target = photo_pair("astronaut")
         expected = reference_ssim(image, target)
         assert 0.2 < expected < 0.95
         assert abs(float(ssim(image, target)) - expected) < 1e-12
         assert abs(float(ssim(image.float(), target.float())) - expected) < 2e-5
-
-    def test_smallest_image_has_one_window(self) -> None:
-        image, target = (t[:, 20:31, 30:41] for t in photo_pair("astronaut"))
-        assert abs(float(ssim(image, target)) - reference_ssim_map(image, target)[:, 5, 5].mean()) < 1e-12
 
     def test_autocast_changes_nothing(self) -> None:
         image, target = (t.float() for t in photo_pair("coffee", 64, 64))
@@ -146,24 +141,15 @@ class TestSsim:
 
 
 class TestMsSsim:
-    # even at every scale; odd at several; the smallest, 161 -> 81 -> 41 -> 21 -> 11
-    @pytest.mark.parametrize(
-        ("name", "size"), [("astronaut", (176, 192)), ("coffee", (201, 187)), ("astronaut", (161, 161))]
-    )
-    def test_matches_paper(self, name: str, size: tuple[int, int]) -> None:
-        image, target = photo_pair(name, *size)
+    def test_matches_paper(self) -> None:
+        """Sides are odd at several scales."""
+        image, target = photo_pair("coffee", 201, 187)
         expected = reference_ms_ssim(image, target)
         assert 0.5 < expected < 0.99
         assert abs(float(ms_ssim(image, target)) - expected) < 1e-12
         assert abs(float(ms_ssim(image.float(), target.float())) - expected) < 2e-5
 
-    def test_negative_structure_is_zero_not_nan(self) -> None:
-        target = photo_pair("coffee")[1].float()
-        values = ms_ssim(torch.stack([1 - target, target]), torch.stack([target, target]))
-        assert values[0] == 0.0
-        assert values[1] > 0.9999
-
-    def test_negative_structure_of_one_scale_is_enough(self) -> None:
+    def test_negative_structure_of_one_scale_is_zero(self) -> None:
         coarse = torch.linspace(0.3, 0.7, 161).expand(1, 161, 161)
         fine = 0.2 * (-1.0) ** torch.arange(161)[:, None]  # gone at the next scale
         assert ms_ssim(coarse + fine, coarse - fine) == 0.0
@@ -187,7 +173,7 @@ class TestEdgeFocused(BaseTester, without={"test_module": "metrics are functions
         assert value.dtype == torch.promote_types(dtype, torch.float32)
 
     @pytest.mark.parametrize("metric", EDGE_FOCUSED)
-    @pytest.mark.parametrize(("lead", "channels"), [((), 1), ((1,), 3), ((2,), 4)])
+    @pytest.mark.parametrize(("lead", "channels"), [((), 1), ((2,), 4)])
     def test_cardinality(
         self, metric: Metric, device: torch.device, dtype: torch.dtype, lead: tuple[int, ...], channels: int
     ) -> None:
@@ -266,9 +252,8 @@ class TestEdgeFocused(BaseTester, without={"test_module": "metrics are functions
 
 class TestCardinality:
     @pytest.mark.parametrize("metric", PLAIN)
-    @pytest.mark.parametrize("channels", [1, 4])
-    def test_any_channels_batched_or_not(self, metric: Metric, channels: int) -> None:
-        image, target = (t[torch.arange(channels) % 3].float() for t in photo_pair("coffee", 161, 161))
+    def test_four_channels_batched_or_not(self, metric: Metric) -> None:
+        image, target = (t[[0, 1, 2, 0]].float() for t in photo_pair("coffee", 161, 161))
         single, other = metric(image, target), metric(target.flip(-1), target)
         assert single.shape == ()
         batch = metric(torch.stack([image, target.flip(-1)]), torch.stack([target, target]))
@@ -277,7 +262,7 @@ class TestCardinality:
         assert abs(single - other) > 1e-2
 
     @pytest.mark.parametrize("metric", PLAIN)
-    @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+    @pytest.mark.parametrize("dtype", [torch.float16, torch.float64])
     def test_dtypes(self, metric: Metric, dtype: torch.dtype) -> None:
         """Half precision is computed in float32; two dtypes meet in the wider one."""
         image, target = (t.to(dtype) for t in photo_pair("coffee", 161, 161))
@@ -291,8 +276,8 @@ class TestTooSmall:
     @pytest.mark.parametrize(
         ("metric", "size", "window"),
         [
-            *[(ssim, size, 11) for size in ((10, 50), (50, 10), (1, 1))],
-            *[(ms_ssim, size, 161) for size in ((160, 400), (400, 160), (11, 11))],
+            (ssim, (50, 10), 11),
+            (ms_ssim, (160, 400), 161),
             (lambda image, target: ef_ssim(image, target, disc_labels(10, 30)), (10, 30), 11),
         ],
     )
@@ -311,12 +296,12 @@ class TestSsimulacra2:
         assert ssimulacra2(photo, photo) == 100
         save_image(tmp_path / "photo.png", photo)
         scores = []
-        for quality in (90, 50, 10):
+        for quality in (90, 10):
             Image.open(tmp_path / "photo.png").save(tmp_path / f"{quality}.jpg", quality=quality)
             scores.append(float(ssimulacra2(load_image(tmp_path / f"{quality}.jpg"), photo)))
             expected = package.compute_ssimulacra2(tmp_path / "photo.png", tmp_path / f"{quality}.jpg")
             assert scores[-1] == pytest.approx(expected, abs=1e-9)
-        assert 100 > scores[0] > 70 > scores[1] > 40 > scores[2]
+        assert 100 > scores[0] > 70 > 40 > scores[1]
         batch = ssimulacra2(torch.stack([photo, 0.9 * photo]), torch.stack([photo, photo]))
         assert batch.tolist() == [100, float(ssimulacra2(0.9 * photo, photo))]
         grey, dark = photo[:1], photo[:1] * 0.9
@@ -335,15 +320,6 @@ class TestGradient:
     @pytest.mark.parametrize("metric", [psnr, ssim])
     def test_gradcheck(self, metric: Metric) -> None:
         BaseTester.gradcheck(metric, small_pair())
-
-    def test_writes_no_image_for_each_tap(self) -> None:
-        """The gradient of a slice is an image of zeros with the slice in it; the filter has 11 taps twice."""
-        image, target = small_pair()
-        value = ssim(image.requires_grad_(), target)
-        with torch.profiler.profile() as profile:
-            value.backward()
-        counts = {event.key: event.count for event in profile.key_averages()}
-        assert 0 < counts["aten::add_"] and counts.get("aten::slice_backward", 0) < 11
 
     def test_second_derivatives_forward_mode_and_vmap(self) -> None:
         image, target = (t.double() for t in small_pair())
@@ -375,14 +351,13 @@ class _MetaDevice(Tensor):
     """A finite tensor whose device is not the CPU, which every machine has: a subclass that says so."""
 
     @property
-    def device(self) -> torch.device:  # type: ignore[override]
+    def device(self) -> torch.device:
         return torch.device("meta")
 
 
 IMAGE = torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(0))
 
 
-@pytest.mark.parametrize("metric", PLAIN)
 @pytest.mark.parametrize(
     ("image", "target", "error", "words"),
     [
@@ -395,20 +370,17 @@ IMAGE = torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(0))
         (IMAGE, IMAGE.as_subclass(_MetaDevice), ValueError, "target must be on cpu"),
     ],
 )
-def test_exception(metric: Metric, image: Tensor, target: Tensor, error: type[Exception], words: str) -> None:
+def test_exception(image: Tensor, target: Tensor, error: type[Exception], words: str) -> None:
     with pytest.raises(error, match=words):
-        metric(image, target)
+        psnr(image, target)
 
 
 class TestLargeImages:
     """Blocks of rows give what the whole image gives, in less memory."""
 
-    @pytest.fixture
-    def metrics(self) -> list[Metric]:
+    def test_blocks_agree_with_the_whole(self, monkeypatch: pytest.MonkeyPatch) -> None:
         labels = (torch.arange(192) > 90).long().expand(176, 192)
-        return [ssim, ms_ssim, lambda image, target: ef_ssim(image, target, labels)]
-
-    def test_blocks_agree_with_the_whole(self, metrics: list[Metric], monkeypatch: pytest.MonkeyPatch) -> None:
+        metrics = [ssim, ms_ssim, lambda image, target: ef_ssim(image, target, labels)]
         image, target = photo_pair("coffee")
         images, targets = torch.stack([image, target.flip(-1)]).requires_grad_(), torch.stack([target, target])
         monkeypatch.setattr(f"{mean_ssim.__module__}._BLOCK", 1 << 30)
@@ -427,6 +399,6 @@ class TestLargeImages:
         images = torch.rand(2, 3, 1200, 1700)
         with torch.profiler.profile(profile_memory=True) as profile:
             ssim(*images)
-        events = profile.profiler.kineto_results.events()  # type: ignore[union-attr]
+        events = profile.profiler.kineto_results.events()
         peak = max(itertools.accumulate(event.nbytes() for event in events if event.name() == "[memory]"))
         assert 0 < peak < 4 * images.nbytes

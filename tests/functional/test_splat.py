@@ -55,16 +55,6 @@ def as_float32(scene: Scene) -> Scene:
     return Scene(*(t.float() for t in scene[:3]), *scene[3:])
 
 
-def suited(scene: Scene, backend: str) -> Scene:
-    """Give a float64 scene in the widest dtype that the backend computes in."""
-    return as_float32(scene) if backend in ("cpu", "cuda") else scene
-
-
-def rounding(backend: str) -> float:
-    """Allow for the arithmetic of :func:`suited` scenes."""
-    return 2e-6 if backend in ("cpu", "cuda") else 1e-11
-
-
 def gradients(scene: Scene, regions: RegionMap | None, **options: object) -> tuple[Tensor, list[Tensor]]:
     inputs = [t.detach().clone().requires_grad_() for t in scene[:3]]
     size = None if regions is not None else tuple(scene.labels.shape)
@@ -89,8 +79,8 @@ class TestRegionSplat(BaseTester):
         assert image.dtype == dtype and image.device.type == device.type
         assert image.isfinite().all() and image.any()
 
-    @pytest.mark.parametrize("lead", [(), (1,), (3,)])
-    @pytest.mark.parametrize(("count", "channels"), [(0, 3), (1, 1), (7, 5)])
+    @pytest.mark.parametrize("lead", [(), (3,)])
+    @pytest.mark.parametrize(("count", "channels"), [(0, 3), (7, 5)])
     def test_cardinality(
         self, backend: str, device: torch.device, dtype: torch.dtype, lead: tuple[int, ...], count: int, channels: int
     ) -> None:
@@ -191,20 +181,21 @@ class TestRegionSplat(BaseTester):
         torch.testing.assert_close(image[0, 0], torch.tensor(share), rtol=0, atol=1e-6)
         assert share[0] == 1.0 and share[5] == 0.0 and 0.5 < share[2] < 1.0
 
-    @pytest.mark.parametrize("softness", [0.0, 0.8])
-    @pytest.mark.parametrize("regions", [1, 3])
-    @pytest.mark.parametrize("backend", ["reference", "tiled"])
+    @pytest.mark.parametrize(
+        ("backend", "regions", "softness"),
+        [("reference", 1, 0.0), ("reference", 3, 0.0), ("reference", 3, 0.8), ("tiled", 3, 0.8)],
+    )
     def test_gradcheck(self, backend: str, regions: int, softness: float) -> None:
-        scene = random_scene(5, (9, 19), regions, channels=2)
+        scene = random_scene(3, (9, 19), regions, channels=2)
         region_map = RegionMap(scene.labels, softness)
 
         def render(means: Tensor, cholesky: Tensor, colors: Tensor) -> Tensor:
             return region_splat(means, cholesky, colors, scene.region_ids, region_map, cutoff=0, backend=backend)
 
-        self.gradcheck(render, scene[:3], fast_mode=(backend, regions, softness) != ("tiled", 3, 0.8))
+        self.gradcheck(render, scene[:3], fast_mode=backend != "tiled")
 
     def test_gradients_of_one_argument(self, backend: str) -> None:
-        scene = suited(random_scene(20, (20, 30), 2), backend)
+        scene = as_float32(random_scene(20, (20, 30), 2))
         full = gradients(scene, RegionMap(scene.labels), backend=backend)[1]
         for position in range(3):
             inputs = [t.detach().requires_grad_(i == position) for i, t in enumerate(scene[:3])]
@@ -222,24 +213,22 @@ class TestRegionSplat(BaseTester):
         expected = region_splat(*(t.to(image.dtype) for t in scene[:3]), *scene[3:], cutoff=1e-3, backend=backend)
         assert expected.any() and torch.equal(image, expected)
 
-    @pytest.mark.parametrize("softness", [0.0, 0.8])
-    def test_dynamo(self, backend: str, device: torch.device, dtype: torch.dtype, softness: float) -> None:
+    def test_dynamo(self, device: torch.device, dtype: torch.dtype) -> None:
         scene = on(device, dtype, random_scene(12, (9, 17), 3))
-        regions = RegionMap(scene.labels, softness)
+        regions = RegionMap(scene.labels, 0.8)
         leaves = [t.requires_grad_() for t in scene[:3]]
 
         def render(*tensors: Tensor) -> Tensor:
-            return region_splat(*tensors, scene.region_ids, regions, backend=backend)
+            return region_splat(*tensors, scene.region_ids, regions)
 
         self.assert_compiles(render, *leaves, leaves=leaves, backend="aot_eager")
 
 
-SIZES = [(1, 1), (1, 700), (33, 16), (47, 61)]
-
-
 class TestAgainstReference:
-    @pytest.mark.parametrize(("regions", "softness"), [(1, 0.0), (5, 0.0), (5, 0.7), (5, 3.0)])
-    @pytest.mark.parametrize("size", SIZES)
+    @pytest.mark.parametrize(
+        ("size", "regions", "softness"),
+        [((1, 1), 1, 0.0), ((1, 700), 5, 0.7), ((33, 16), 5, 0.0), ((47, 61), 1, 0.0), ((47, 61), 5, 3.0)],
+    )
     def test_cutoff_zero(self, backend: str, size: tuple[int, int], regions: int, softness: float) -> None:
         scene = random_scene(60, size, regions)
         region_map = RegionMap(scene.labels, softness)
@@ -250,14 +239,13 @@ class TestAgainstReference:
         assert expected.abs().max() > 1e-3
         assert_gradients_close(result_gradients, expected_gradients, 1e-4)
 
-    @pytest.mark.parametrize("cutoff", [1e-2, 1e-4])
-    def test_cutoff_error_is_bounded(self, backend: str, cutoff: float) -> None:
+    def test_cutoff_error_is_bounded(self, backend: str) -> None:
         scene = random_scene(300, (64, 80), 3)
         exact = region_splat(*scene, cutoff=0, backend="reference")
-        result = region_splat(*as_float32(scene), cutoff=cutoff, backend=backend)
+        result = region_splat(*as_float32(scene), cutoff=1e-2, backend=backend)
         # every skipped weight is below the cutoff: the error is at most cutoff x the colours that overlap
         overlap = scene.colors.abs().sum()
-        assert (result - exact).abs().max() <= 2 * cutoff * overlap
+        assert (result - exact).abs().max() <= 2e-2 * overlap
         assert (result - exact).abs().max() > 0
 
     @pytest.mark.parametrize(
@@ -274,16 +262,14 @@ class TestAgainstReference:
         error = (result - exact).abs().max()
         assert error <= 3.2e-4 and (backend != "cpu" or error > 1.6e-4)
 
-    @pytest.mark.parametrize(
-        ("count", "size", "channels"), [(3000, (16, 16), 3), *[(40, (20, 30), n) for n in (1, 2, 4, 9, 32)]]
-    )
+    @pytest.mark.parametrize(("count", "size", "channels"), [(3000, (16, 16), 3), (40, (20, 30), 1), (40, (20, 30), 9)])
     def test_channels_and_long_lists(self, backend: str, count: int, size: tuple[int, int], channels: int) -> None:
         """3000 Gaussians of one tile are more than a segment of the kernels' lists."""
         scene = random_scene(count, size, 3, channels=channels)
         regions = RegionMap(scene.labels)
         expected, expected_gradients = gradients(scene, regions, cutoff=0, backend="reference")
-        result, result_gradients = gradients(suited(scene, backend), regions, cutoff=0, backend=backend)
-        tolerance = (100 if count > 40 else 10) * rounding(backend)
+        result, result_gradients = gradients(as_float32(scene), regions, cutoff=0, backend=backend)
+        tolerance = 2e-4 if count > 40 else 2e-5
         torch.testing.assert_close(result.double(), expected, rtol=tolerance, atol=tolerance)
         assert_gradients_close(result_gradients, expected_gradients, tolerance)
 
@@ -322,7 +308,7 @@ class TestConventions:
         image.sum().backward()
         assert empty[0].grad is None or empty[0].grad.shape == (0, 2)
 
-    @pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.uint16, torch.uint32])
+    @pytest.mark.parametrize("dtype", [torch.uint8, torch.uint32])
     def test_integer_dtypes_of_ids(self, backend: str, dtype: torch.dtype) -> None:
         scene = as_float32(random_scene(20, (20, 30), 2))
         image = region_splat(*scene[:3], scene.region_ids.to(dtype), scene.labels.to(dtype), backend=backend)
@@ -344,15 +330,3 @@ class TestConventions:
         first, second = (gradients(scene, region_map, backend=backend) for _ in range(2))
         assert torch.equal(first[0], second[0])
         assert all(torch.equal(a, b) for a, b in zip(first[1], second[1], strict=True))
-
-
-class TestExtremes:
-    """Image error against float64, relative to the largest colour; gradients finite."""
-
-    def test_far_outside(self, backend: str) -> None:
-        means = torch.tensor([[1e5, 3.0], [-1e7, 1e7], [4.0, 4.0], [1e8, -1e8]])
-        cholesky = torch.tensor([[1.0, 0.0, 1.0], [2e-6, 1e8, 2e-6], [2.0, 0.0, 2.0], [1e8, 1e8, 1e8]])
-        scene = Scene(means, cholesky, torch.full((4, 1), 1e6), torch.zeros(4).long(), torch.zeros(9, 9).long())
-        image, grads = gradients(scene, None, cutoff=0, backend=backend)
-        assert torch.isfinite(image).all() and all(torch.isfinite(g).all() for g in grads)
-        assert image.abs().max() > 1e5

@@ -9,50 +9,31 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcgs import RegionMap
 from kcgs.functional import region_splat, scale_rotation_to_cholesky
 
 FAST = ["tiled", "cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 SIZE = (40, 50)
 
 
-def splat(
-    scene: list[Tensor],
-    ids: Tensor | None = None,
-    regions: RegionMap | Tensor | None = None,
-    *,
-    backend: str,
-    **settings: Any,
-) -> Tensor:
+def splat(scene: list[Tensor], *regions: Tensor, backend: str, **settings: Any) -> Tensor:
     """Render on the backend's device; tensors come from the CPU, and so does the image."""
     device = "cuda" if backend == "cuda" else "cpu"
-    regions = None if regions is None else regions.to(device)
-    ids = None if ids is None else ids.to(device)
-    return region_splat(*(t.to(device) for t in scene), ids, regions, backend=backend, **settings).cpu()
+    return region_splat(*(t.to(device) for t in (*scene, *regions)), backend=backend, **settings).cpu()
 
 
-def render(
-    backend: str, scene: list[Tensor], ids: Tensor | None = None, regions: RegionMap | None = None
-) -> list[Tensor]:
+def render(backend: str, scene: list[Tensor]) -> list[Tensor]:
     """Return the image and the gradients, of the reference in float64, of others in float32."""
-    inputs = [t.detach().to(torch.float64 if backend == "reference" else torch.float32) for t in scene]
-    size = SIZE if regions is None else None
-    image = splat([t.requires_grad_() for t in inputs], ids, regions, size=size, cutoff=0, backend=backend)
+    dtype = torch.float64 if backend == "reference" else torch.float32
+    inputs = [t.detach().to(dtype).requires_grad_() for t in scene]
+    image = splat(inputs, size=SIZE, cutoff=0, backend=backend)
     probe = torch.cos(torch.linspace(0, 60, image.numel(), dtype=torch.float64)).view_as(image)
-    (image.double() * probe).sum().backward()
-    assert torch.isfinite(image).all()
-    return [image.detach().double(), *(t.grad.double() for t in inputs if t.grad is not None)]
+    return [image.detach().double(), *(g.double() for g in torch.autograd.grad((image.double() * probe).sum(), inputs))]
 
 
-def compare(
-    backend: str, scene: list[Tensor], ids: Tensor | None = None, regions: RegionMap | None = None
-) -> tuple[float, float, float]:
-    return errors(render(backend, scene, ids, regions), render("reference", scene, ids, regions))
-
-
-def errors(result: list[Tensor], expected: list[Tensor]) -> tuple[float, float, float]:
+def errors(backend: str, scene: list[Tensor]) -> tuple[float, float, float]:
     """Return the image error, the gradient error relative to each component's largest, and 1 - cosine."""
-    assert all(torch.isfinite(g).all() for g in result)
+    result, expected = render(backend, scene), render("reference", scene)
+    assert all(torch.isfinite(t).all() for t in result)
     gradient, angle = 0.0, 0.0
     for g, w in zip(result[1:], expected[1:], strict=True):
         gradient = max(gradient, float(((g - w).abs() / w.abs().amax(0).clamp_min(1e-12)).max()))
@@ -66,7 +47,7 @@ def centres(count: int) -> Tensor:
 
 
 @pytest.mark.parametrize("backend", FAST)
-@pytest.mark.parametrize("anisotropy", [1.0, 1e2, 1e6])
+@pytest.mark.parametrize("anisotropy", [1.0, 1e6])
 @pytest.mark.parametrize("sigma", [0.05, 1.0, 1e4])
 def test_sigma_and_anisotropy_at_every_angle(backend: str, sigma: float, anisotropy: float) -> None:
     """Image within 1e-5 a Gaussian, gradients within 1e-3; whitened coordinates keep both, however thin."""
@@ -74,7 +55,7 @@ def test_sigma_and_anisotropy_at_every_angle(backend: str, sigma: float, anisotr
     angle = torch.cat([torch.linspace(0, math.pi, 17), torch.tensor([1e-7, math.pi / 2 - 1e-7])]).double()
     scales = torch.tensor([long, sigma], dtype=torch.float64).expand(19, 2)
     cholesky = scale_rotation_to_cholesky(scales, angle).float()
-    image, gradient, angle_error = compare(backend, [centres(19), cholesky, torch.ones(19, 2)])
+    image, gradient, angle_error = errors(backend, [centres(19), cholesky, torch.ones(19, 2)])
     assert image < 1e-5 * 19
     assert gradient < 1e-3
     assert angle_error < 1e-6
@@ -84,18 +65,17 @@ def test_sigma_and_anisotropy_at_every_angle(backend: str, sigma: float, anisotr
 @pytest.mark.parametrize("size", [1e-8, 1e6])
 def test_colours_of_any_size(backend: str, size: float) -> None:
     cholesky = torch.tensor([[3.0, 1.0, 2.0]]).repeat(30, 1)
-    image, gradient, _ = compare(backend, [centres(30), cholesky, size * torch.rand(30, 3)])
+    image, gradient, _ = errors(backend, [centres(30), cholesky, size * torch.rand(30, 3)])
     assert image < 1e-5 * size
     assert gradient < 1e-5
 
 
 @pytest.mark.parametrize("backend", FAST)
-@pytest.mark.parametrize("distance", [1e3, 1e5, 1e7])
-def test_centres_far_away(backend: str, distance: float) -> None:
-    angle = torch.linspace(0, 2 * math.pi, 13)
+def test_centres_far_away(backend: str) -> None:
+    distance, angle = 1e7, torch.linspace(0, 2 * math.pi, 13)
     means = distance * torch.stack([angle.cos(), angle.sin()], -1)
     cholesky = torch.tensor([[distance, 0.3 * distance, distance / 2]]).repeat(13, 1)
-    image, gradient, _ = compare(backend, [means, cholesky, torch.ones(13, 1)])
+    image, gradient, _ = errors(backend, [means, cholesky, torch.ones(13, 1)])
     assert image < 1e-5
     assert gradient < 1e-4
 
@@ -115,24 +95,21 @@ def test_weights_that_are_nothing(backend: str, dtype: torch.dtype) -> None:
 
 
 @pytest.mark.parametrize("backend", FAST)
-def test_65535_regions_of_a_few_pixels(backend: str) -> None:
-    labels = torch.arange(256 * 512).view(256, 512) // 2 % 65_535
-    ids = torch.arange(0, 65_535, 7)
-    generator = torch.Generator().manual_seed(0)
-    means = torch.stack([2.0 * (ids % 256) + 1, ids // 256 + 0.5], -1)
-    colors = torch.rand(len(ids), 1, generator=generator)
+def test_thousands_of_regions_of_a_pixel(backend: str) -> None:
+    labels = torch.arange(128 * 128).view(128, 128)
+    ids = torch.arange(0, labels.numel(), 7)
+    colors = 0.1 + torch.rand(len(ids), 1, generator=torch.Generator().manual_seed(0))
     cholesky = torch.tensor([[4.0, 0.0, 4.0]]).repeat(len(ids), 1)
-    image = splat([means, cholesky, colors], ids, labels, backend=backend)
-    painted = torch.zeros(65_535).index_put((ids,), colors[:, 0])
-    expected = painted[labels[0, ::2]] * math.exp(-0.5 * (0.5 / 4) ** 2)
-    torch.testing.assert_close(image[0, 0, ::2], expected, rtol=1e-3, atol=1e-6)
-    assert (image[0] > 0).float().mean() == pytest.approx(1 / 7, abs=0.01)
+    means = torch.stack([ids % 128, ids // 128], -1) + 0.5
+    image = splat([means, cholesky, colors], ids, labels, backend=backend).flatten()
+    torch.testing.assert_close(image[ids], colors[:, 0], rtol=1e-3, atol=1e-6)
+    assert int(image.count_nonzero()) == len(ids)
 
 
 @pytest.mark.parametrize("backend", FAST)
-def test_8k_image(backend: str) -> None:
-    height, width = 4320, 7680
-    means = torch.tensor([[7000.3, 4000.7], [100.0, 4319.5], [3840.0, 2160.0]])
+def test_a_wide_image(backend: str) -> None:
+    height, width = 64, 7680
+    means = torch.tensor([[7000.3, 40.7], [100.0, 63.5], [3840.0, 20.0]])
     cholesky = torch.tensor([[30.0, 10.0, 20.0], [50.0, 0.0, 3.0], [400.0, -300.0, 200.0]])
     image = splat([means, cholesky, torch.ones(3, 1)], size=(height, width), backend=backend)
     assert torch.isfinite(image).all()

@@ -38,8 +38,8 @@ class TestGaussianField(BaseTester):
         assert field.means.device.type == device.type and field.colors.dtype == whole(dtype)
         assert all(p.isfinite().all() and p.any() for p in field.parameters())
 
-    @pytest.mark.parametrize("lead", [(), (1,), (3,)])
-    @pytest.mark.parametrize(("count", "channels"), [(0, 3), (1, 1), (7, 5)])
+    @pytest.mark.parametrize("lead", [(), (3,)])
+    @pytest.mark.parametrize(("count", "channels"), [(0, 3), (7, 5)])
     def test_cardinality(
         self, device: torch.device, dtype: torch.dtype, lead: tuple[int, ...], count: int, channels: int
     ) -> None:
@@ -48,7 +48,7 @@ class TestGaussianField(BaseTester):
         assert field.num_gaussians == count and field.merged_colors().shape == (*lead, count, channels)
         assert field.means.dtype == whole(dtype) and field.size == SIZE
         labels = torch.zeros(*lead, *SIZE, device=device, dtype=torch.long)
-        assert field.assign_regions(labels).region_ids.shape == (*lead, count)  # type: ignore[union-attr]
+        assert field.assign_regions(labels).region_ids.shape == (*lead, count)
         one = field[0] if lead else field
         assert one.means.shape == (count, 2) and one.subset(torch.arange(count)).num_gaussians == count
 
@@ -84,7 +84,7 @@ class TestGaussianField(BaseTester):
         assert other.cholesky is field.cholesky and other.colors is colors and other.means is not means
         assert {name for name, _ in other.named_buffers()} == {"colors", "region_ids"}
         other.double()
-        assert other.region_ids is not None and other.region_ids.dtype == torch.int64
+        assert other.region_ids.dtype == torch.int64
         assert RegionSplatRenderer()(other, labels).dtype == torch.float64 and means.dtype == torch.float32
 
     def test_random_is_seeded(self) -> None:
@@ -92,34 +92,32 @@ class TestGaussianField(BaseTester):
         assert torch.equal(a.means, b.means) and torch.equal(a.colors, b.colors)
         assert not torch.equal(a.means, GaussianField.random(10, SIZE, seed=4).means)
 
-    @pytest.mark.parametrize("move", [lambda f: f.half(), lambda f: f.bfloat16(), lambda f: f.to(torch.float16)])
-    def test_half_is_refused_aloud(self, field: GaussianField, move: object) -> None:
+    def test_half_is_refused_aloud(self, field: GaussianField) -> None:
         before = field.means.detach().clone()
         with pytest.warns(UserWarning, match="stays in float32"):
-            move(field)  # type: ignore[operator]
+            field.bfloat16()
         assert field.means.dtype == field.colors.dtype == torch.float32
         assert torch.equal(field.means, before)
 
     def test_subset(self, field: GaussianField, labels: Tensor) -> None:
-        assert field.region_ids is not None
         inside = field.region_ids == 4
         part, rest = field.subset(inside), field.subset((~inside).nonzero().flatten())
         assert part.num_gaussians + rest.num_gaussians == 60 and 0 < part.num_gaussians < 60
         total = RegionSplatRenderer()(part, labels) + RegionSplatRenderer()(rest, labels)
         torch.testing.assert_close(total, RegionSplatRenderer()(field, labels))
 
-    @pytest.mark.parametrize("kind", ["plain", "opacities", "double"])
-    def test_stack_and_back(self, field: GaussianField, labels: Tensor, kind: str) -> None:
+    @pytest.mark.parametrize("confined", [False, True])
+    def test_stack_and_back(self, field: GaussianField, confined: bool) -> None:
         """A batch has what each field has, as leaves of its own."""
-        fields = [field, GaussianField.random(60, SIZE, regions=labels, seed=1)]
-        if kind == "opacities":
-            fields = [GaussianField(f.means, f.cholesky, f.colors, opacities=torch.rand(60), size=SIZE) for f in fields]
-        batch = GaussianField.stack([f.double() if kind == "double" else f for f in fields])
+        last = "region_ids" if confined else "opacities"
+        if not confined:
+            field = GaussianField(field.means, field.cholesky, field.colors, opacities=torch.rand(60), size=SIZE)
+        fields = [field, field.shift(1.0, 0.0).subset(torch.arange(60))]
+        batch = GaussianField.stack(fields)
         assert all(isinstance(p, nn.Parameter) and len(p) == 2 for p in batch.parameters())
         for one, again in zip(fields, batch.unbind(), strict=True):
             assert one.size == again.size and one.state_dict().keys() == again.state_dict().keys()
-            assert all(torch.equal(value, again.state_dict()[name]) for name, value in one.state_dict().items()
-                       if isinstance(value, Tensor))  # fmt: skip
+            assert all(torch.equal(getattr(one, n), getattr(again, n)) for n in ("means", "cholesky", "colors", last))
 
     @pytest.mark.parametrize(
         ("other", "error", "words"),
@@ -127,9 +125,6 @@ class TestGaussianField(BaseTester):
             ([], ValueError, "fields must hold at least one; got none"),
             ([nn.Linear(2, 3)], TypeError, "fields must be GaussianFields; got Linear"),
             ([GaussianField.random(60, SIZE), GaussianField.random(59, SIZE)], ValueError, "alike.* 60 .*got .* 59 "),
-            ([GaussianField.random(9, SIZE), GaussianField.random(9, (24, 35))], ValueError, r"alike.*got .*24, 35"),
-            ([GaussianField.random(9, SIZE, regions=torch.ones(SIZE).long()), GaussianField.random(9, SIZE)],
-             ValueError, "with 9 Gaussians.* confined.*got .* not confined"),
             ([GaussianField.stack([GaussianField.random(9, SIZE)])], ValueError, "one image each.*got one with 1 x 9"),
         ],
     )  # fmt: skip
@@ -148,9 +143,6 @@ class TestGaussianField(BaseTester):
         )
         image = RegionSplatRenderer()(with_alpha, labels)
         torch.testing.assert_close(image, RegionSplatRenderer()(merged, labels))
-        image.sum().backward()
-        assert with_alpha.opacities is not None and with_alpha.opacities.grad is not None
-        assert with_alpha.opacities.grad.abs().max() > 0
 
     @pytest.mark.parametrize(
         ("change", "error", "words"),
@@ -176,23 +168,26 @@ class TestGaussianField(BaseTester):
             field.subset(mask)
 
 
-class TestRegionSplatRenderer(BaseTester, without={"test_module": "TestRegionSplat compares it with its twin"}):
+WITHOUT = {
+    "test_smoke": "test_feature computes with it on each device",
+    "test_module": "TestRegionSplat compares it with its twin",
+    "test_dynamo": "compiled in tests/pipelines/test_torch_transforms.py",
+}
+
+
+class TestRegionSplatRenderer(BaseTester, without=WITHOUT):
     def scene(self, device: torch.device, dtype: torch.dtype, labels: Tensor, count: int = 60) -> Scene:
         field = GaussianField.random(count, SIZE, regions=labels, seed=0, dtype=whole(dtype))
         return Scene(field, labels).to(device)
 
-    def test_smoke(self, backend: str, device: torch.device, dtype: torch.dtype, labels: Tensor) -> None:
-        image = RegionSplatRenderer(backend=backend)(self.scene(device, dtype, labels))
-        assert image.dtype == whole(dtype) and image.device.type == device.type
-        assert image.isfinite().all() and image.any()
-
-    @pytest.mark.parametrize(("keepdim", "size"), [(True, None), (False, (10, 50))])
-    @pytest.mark.parametrize("lead", [(), (1,), (2,)])
+    @pytest.mark.parametrize(
+        ("lead", "keepdim", "size"), [((), True, None), ((), False, (10, 50)), ((2,), False, None)]
+    )
     def test_cardinality(
-        self, backend: str, device: torch.device, lead: tuple[int, ...], keepdim: bool, size: tuple[int, int] | None
+        self, device: torch.device, lead: tuple[int, ...], keepdim: bool, size: tuple[int, int] | None
     ) -> None:
         tensors = [torch.ones(*lead, 5, n, device=device) for n in (2, 3, 4)]
-        image = RegionSplatRenderer(backend=backend, keepdim=keepdim)(GaussianField(*tensors, size=SIZE), size=size)
+        image = RegionSplatRenderer(keepdim=keepdim)(GaussianField(*tensors, size=SIZE), size=size)
         assert image.shape == ((*lead, 4) if keepdim or lead else (1, 4)) + (size or SIZE) and image.any()
 
     def test_gradcheck(self, device: torch.device, labels: Tensor) -> None:
@@ -206,19 +201,15 @@ class TestRegionSplatRenderer(BaseTester, without={"test_module": "TestRegionSpl
 
         self.gradcheck(draw, (scene.field.means, scene.field.cholesky, scene.field.colors))
 
-    def test_feature(self, backend: str, device: torch.device, dtype: torch.dtype, labels: Tensor) -> None:
+    def test_feature(self, device: torch.device, dtype: torch.dtype, labels: Tensor) -> None:
         """Each block of 3 x 3 pixels has the centre of its middle where a pixel of the small image has it."""
-        scene, render = self.scene(device, dtype, labels), RegionSplatRenderer(0.0, backend=backend)
+        scene, render = self.scene(device, dtype, labels), RegionSplatRenderer(0.0)
         inside = ~edge_band(labels, width=4).to(device)
         image = render(scene, size=(72, 108))[:, 1::3, 1::3]
         self.assert_close(image[:, inside], render(scene)[:, inside], rtol=1e-4, atol=1e-5)
         scene = Scene(scene.field.subset(torch.arange(scene.num_gaussians)))
         scene.field.region_ids = None
         self.assert_close(render(scene, size=(24, 108))[:, :, 1::3], render(scene), rtol=1e-4, atol=1e-5)
-
-    def test_dynamo(self, backend: str, device: torch.device, dtype: torch.dtype, labels: Tensor) -> None:
-        scene, render = self.scene(device, dtype, labels), RegionSplatRenderer(clamp=True, backend=backend)
-        self.assert_compiles(lambda: render(scene), leaves=list(scene.parameters()), rtol=1e-4, atol=1e-5)
 
     def test_clamp(self, field: GaussianField, labels: Tensor) -> None:
         with torch.no_grad():
@@ -227,8 +218,7 @@ class TestRegionSplatRenderer(BaseTester, without={"test_module": "TestRegionSpl
         assert free.min() < 0 and free.max() > 1
         assert torch.equal(clamped, free.clamp(0, 1))
 
-    @pytest.mark.parametrize("size", [(12, 18), (1, 1), (30, 11), (23, 35)])
-    @pytest.mark.parametrize("softness", [None, 0.8])
+    @pytest.mark.parametrize(("size", "softness"), [((1, 1), None), ((30, 11), 0.8), ((23, 35), None)])
     def test_a_smaller_image_is_the_area_mean(
         self, field: GaussianField, labels: Tensor, size: tuple[int, int], softness: float | None
     ) -> None:
@@ -290,16 +280,13 @@ class TestBatch:
             labels[:] = torch.tensor(ids)[torch.arange(SIZE[1]) * len(ids) // SIZE[1]]
         return maps
 
-    @pytest.mark.parametrize("form", ["tensor", "hard", "soft", "pairs", "each", "resized"])
+    @pytest.mark.parametrize("form", ["tensor", "pairs", "resized"])
     def test_is_its_images(self, maps: Tensor, backend: str, form: str) -> None:
-        pairs, each = {(0, 4): 1.0, (9, 5): 0.5}, [0.7, 0.0, {(2, 9): 1.3}]  # one softness, or one for each map
-        softness = {"soft": 0.8, "resized": each, "pairs": pairs, "each": each}.get(form, 0.0)
-        regions = maps if form == "tensor" else RegionMap(maps, softness)  # type: ignore[arg-type]
+        softness = {"pairs": {(0, 4): 1.0, (9, 5): 0.5}, "resized": [0.7, 0.0, {(2, 9): 1.3}]}
+        regions = maps if form == "tensor" else RegionMap(maps, softness[form])
         size = (40, 50) if form == "resized" else None
         parts = [GaussianField.random(30, SIZE, regions=labels, seed=k) for k, labels in enumerate(maps)]
-        leaves = [torch.stack([getattr(f, name).detach() for f in parts]) for name in ("means", "cholesky", "colors")]
-        batch = GaussianField(*leaves, size=SIZE).assign_regions(regions)
-        assert batch.region_ids is not None
+        batch = GaussianField.stack(parts).assign_regions(regions)
         assert [tuple(row.unique().tolist()) for row in batch.region_ids] == [tuple(sorted(ids)) for ids in self.IDS]
         render = RegionSplatRenderer(backend=backend)
         images = render(batch, regions, size)
@@ -317,9 +304,9 @@ class TestBatch:
 class TestHalf:
     """Half precision in: computed in float32, in the dtype of the colours out."""
 
-    def test_function(self, field: GaussianField, labels: Tensor, backend: str, dtype: torch.dtype) -> None:
+    def test_function(self, field: GaussianField, labels: Tensor, dtype: torch.dtype) -> None:
         def render(*tensors: Tensor) -> Tensor:
-            return region_splat(*tensors, field.region_ids, labels, backend=backend)
+            return region_splat(*tensors, field.region_ids, labels)
 
         halves = [p.detach().to(dtype).requires_grad_() for p in (field.means, field.cholesky, field.colors)]
         floats = [t.detach().float().requires_grad_() for t in halves]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import product
 
 import numpy as np
@@ -45,10 +46,6 @@ def same(one: Scene, other: Scene) -> bool:
     return all(torch.equal(a, b) for (name, a), (_, b) in pairs if isinstance(a, Tensor))
 
 
-def tensors(scene: Scene) -> list[Tensor]:
-    return [t.detach() for t in (scene.field.means, scene.field.cholesky, scene.field.colors)]
-
-
 def test_hole_is_in_range_and_about_as_steep_as_around(scene: Scene) -> None:
     hole = object_mask()
     before, after = (delete_region(scene, 1, fill=f)().detach() for f in (False, True))
@@ -78,23 +75,16 @@ def test_thin_region_beside_the_hole_stays() -> None:
     assert difference.max() < 0.15  # it is 0.35 darker than the ground
 
 
-def test_none_is_the_edit_alone(scene: Scene) -> None:
-    edited = delete_region(scene, 1, fill=False)
-    assert scene.field.region_ids is not None
-    kept = scene.field.subset(scene.field.region_ids != 1)
-    assert all(torch.equal(a, b) for a, b in zip(tensors(edited), tensors(Scene(kept)), strict=True))
-    moved = move_region(scene, 1, (40, 0), fill=False)
-    assert moved.num_gaussians == scene.num_gaussians
-
-
 def test_same_bits_again(scene: Scene) -> None:
     assert same(delete_region(scene, 1), delete_region(scene, 1))
-    assert same(move_region(scene, 1, (10, 3)), move_region(scene, 1, (10, 3)))
+
+
+def move(scene: Scene, region: int) -> Scene:
+    return move_region(scene, region, (8, 0))
 
 
 def test_move_fills_what_it_uncovers(scene: Scene) -> None:
     moved = move_region(scene, 1, (9, 0))
-    assert moved.regions is not None
     landed = moved.regions.labels == 1
     today = move_region(scene, 1, (9, 0), fill=False)
     torch.testing.assert_close(moved()[:, landed], today()[:, landed], rtol=0, atol=1e-5)
@@ -106,17 +96,19 @@ def test_move_that_uncovers_nothing_is_not_fitted(scene: Scene) -> None:
     assert same(move_region(scene, 1, (0, 0)), move_region(scene, 1, (0, 0), fill=False))
 
 
-@pytest.mark.parametrize(("channels", "dtype"), [(1, torch.float64), (4, torch.float32)])
-def test_channels_dtypes_opacities_and_soft_maps(channels: int, dtype: torch.dtype) -> None:
+@pytest.mark.parametrize(("channels", "dtype", "edit"), [(1, torch.float64, delete_region), (4, torch.float32, move)])
+def test_channels_dtypes_opacities_and_soft_maps(
+    channels: int, dtype: torch.dtype, edit: Callable[[Scene, int], Scene]
+) -> None:
     labels = object_mask().long()
     labels[:10] += 4
     regions = RegionMap(labels, {(0, 1): 0.8, (0, 4): 0.4})
-    field = GaussianField.random(80, SIZE, channels=channels, regions=regions, seed=0, dtype=dtype)
+    field = GaussianField.random(50, SIZE, channels=channels, regions=regions, seed=0, dtype=dtype)
     alpha = torch.linspace(0.2, 1.0, field.num_gaussians, dtype=dtype)
     scene = Scene(GaussianField(field.means, field.cholesky, field.colors, field.region_ids, alpha, size=SIZE), regions)
-    for edited in (delete_region(scene, 1), move_region(scene, 1, (8, 0))):
-        assert edited().dtype == dtype and edited().shape == (channels, *SIZE) and edited().isfinite().all()
-        assert edited.field.opacities is not None and edited.field.opacities.shape == (edited.num_gaussians,)
+    edited = edit(scene, 1)
+    assert edited().dtype == dtype and edited().shape == (channels, *SIZE) and edited().isfinite().all()
+    assert edited.field.opacities is not None and edited.field.opacities.shape == (edited.num_gaussians,)
 
 
 def test_hole_of_one_pixel_and_no_gaussian_left() -> None:
@@ -142,36 +134,19 @@ def test_match_continues_an_edge_where_a_mean_blurs_it() -> None:
 
 def test_parts_of_a_hole_have_places_of_their_own() -> None:
     """Two patterns, one above the other, whose periods have no multiple in the image in common."""
-    y, x = torch.meshgrid(torch.arange(96), torch.arange(192), indexing="ij")
-    image = 0.5 + 0.3 * torch.sin(2 * torch.pi * x / torch.where(y < 48, 16, 22)).expand(3, -1, -1)
-    hole = torch.zeros(96, 192).bool()
-    hole[8:88, 80:112] = True
+    y, x = torch.meshgrid(torch.arange(64), torch.arange(128), indexing="ij")
+    image = 0.5 + 0.3 * torch.sin(2 * torch.pi * x / torch.where(y < 32, 10, 14)).expand(3, -1, -1)
+    hole = torch.zeros(64, 128).bool()
+    hole[6:58, 54:76] = True
     smooth, copied = (fill(torch.where(hole, 0.0, image), hole)[:, hole] for fill in (inpaint, inpaint_from_matches))
     blurred, sharp = ((pixels - image[:, hole]).abs().mean() for pixels in (smooth, copied))
     assert sharp < 0.5 * blurred
 
 
-def test_seams_are_where_layers_are_alike() -> None:
-    """The second layer fits the left border, the third one the right border; they are alike in two columns alone."""
-    image, hole = torch.zeros(1, 5, 12), torch.zeros(5, 12).bool()
-    image[:, :, 8:], hole[:, 2:10] = 1.0, True
-    left, right = torch.zeros(1, 5, 12), torch.ones(1, 5, 12)
-    left[:, :, 5:7] = right[:, :, 5:7] = 0.5
-    layers = torch.stack([image, left, right])
-    costs = torch.zeros(3, 5, 12)
-    costs[0] = 9.0
-    labels = choose_layers(layers, costs, hole)
-    assert (labels[:, 2:6] == 1).all() and (labels[:, 6:10] == 2).all()
-    assert (labels[~hole] == 0).all()
-    costs[1] = 9.0  # but the first one
-    assert (choose_layers(layers, costs, hole)[hole] == 2).all()
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_no_step_lowers_the_cost_of_a_choice_of_two(seed: int) -> None:
-    """Of two layers a cut finds the best choice: compared with all 64."""
-    generator = torch.Generator().manual_seed(seed)
-    layers, costs = torch.rand(2, 3, 4, 5, generator=generator), 0.5 * torch.rand(2, 4, 5, generator=generator)
+def test_steps_find_the_best_choice_of_three() -> None:
+    """Compared with all 729; a wrong cost of pixels that have changed before would miss it."""
+    generator = torch.Generator().manual_seed(22)
+    layers, costs = 0.1 * torch.rand(3, 3, 4, 5, generator=generator), 0.5 * torch.rand(3, 4, 5, generator=generator)
     hole = torch.zeros(4, 5).bool()
     hole[1:3, 1:4] = True
 
@@ -186,8 +161,8 @@ def test_no_step_lowers_the_cost_of_a_choice_of_two(seed: int) -> None:
             total += sum(float((layers[one, :, *place] - layers[other, :, *place]).norm()) for place in seen)
         return total
 
-    bits = product((0, 1), repeat=6)
-    choices = [torch.zeros(4, 5, dtype=torch.int64).masked_scatter(hole, torch.tensor(choice)) for choice in bits]
+    numbers = product(range(3), repeat=6)
+    choices = [torch.zeros(4, 5, dtype=torch.int64).masked_scatter(hole, torch.tensor(choice)) for choice in numbers]
     assert cost(choose_layers(layers, costs, hole)) == pytest.approx(min(map(cost, choices)), abs=1e-3)
 
 

@@ -9,12 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from kcgs import GaussianField, RegionMap, RegionSplatRenderer, Scene, fit
-from kcgs.fitting import initial_field
-from kcgs.functional import lookup_regions, psnr
+from kcgs.functional import psnr
 from kcgs.segment import segment
 
 
-@pytest.fixture(scope="module")
 def photo() -> Tensor:
     """Draw a bright bar and a dark disc on a textured ground, (1, 3, 72, 88)."""
     y, x = torch.meshgrid(torch.linspace(0, 1, 72), torch.linspace(0, 1, 88), indexing="ij")
@@ -24,14 +22,14 @@ def photo() -> Tensor:
     return (image + 0.06 * torch.sin(31 * x + 9 * y) * torch.cos(23 * y))[None].clamp(0, 1)
 
 
-def test_augment_segment_fit_draw_measure(photo: Tensor) -> None:
+def test_augment_segment_fit_measure() -> None:
     torch.manual_seed(0)
     augment = nn.Sequential(
         K.RandomHorizontalFlip(p=1.0),
         K.RandomCrop((48, 64), p=1.0),
         K.ColorJiggle(0.1, 0.1, 0.1, 0.02, p=1.0),
     )
-    image = augment(photo).clamp(0, 1)
+    image = augment(photo()).clamp(0, 1)
     assert image.shape == (1, 3, 48, 64)
 
     labels = segment(image[0])
@@ -43,54 +41,13 @@ def test_augment_segment_fit_draw_measure(photo: Tensor) -> None:
     assert quality > 40
     assert kornia.metrics.ssim(render, image, 5).mean() > 0.94
     torch.testing.assert_close(psnr(render, image).squeeze(), quality, rtol=1e-3, atol=1e-3)
-    # the scene and its labels go on through the same augmentation as any image does
-    flipped = K.RandomHorizontalFlip(p=1.0)(render)
-    torch.testing.assert_close(flipped, render.flip(-1))
 
 
-def test_labels_follow_a_geometric_augmentation(photo: Tensor) -> None:
-    """Image and label map are rotated as one; the fit on the pair beats the fit without labels at the same count."""
-    torch.manual_seed(0)
-    labels = segment(photo[0])
-    both = K.AugmentationSequential(K.RandomRotation((20.0, 20.0), p=1.0), data_keys=["image", "mask"])
-    image, turned = both(photo, labels[None, None].float())
-    image, turned = K.CenterCrop((40, 48))(image).clamp(0, 1), K.CenterCrop((40, 48), resample="nearest")(turned)
-    quality = []
-    for regions in (turned[0, 0].round().long(), None):
-        scene = fit(image, regions, num_gaussians=24, iterations=80).scene
-        quality.append(float(kornia.metrics.psnr(scene.render(), image, 1.0)))
-    assert quality[0] > quality[1] + 1
-
-
-def test_a_batch_of_images_and_masks_is_augmented_together(photo: Tensor) -> None:
-    """Masks come back with whole ids, and start Gaussians of the images that they came back with."""
-    torch.manual_seed(0)
-    images = torch.cat([photo, photo.flip(-1), 1 - photo])
-    labels = segment(images)
-    both = K.AugmentationSequential(
-        K.RandomHorizontalFlip(), K.RandomRotation(20.0, p=1.0), K.RandomResizedCrop((40, 48)), K.ColorJiggle(0.2),
-        data_keys=["image", "mask"],
-    )  # fmt: skip
-    images, masks = both(images, labels[:, None].float())
-    assert masks.shape == (3, 1, 40, 48) and set(masks.unique().tolist()) <= set(labels.unique().tolist())
-    field = initial_field(images, 60, masks)
-    assert torch.equal(field.region_ids, lookup_regions(field.means, masks[:, 0].long()))  # type: ignore[arg-type]
-    assert RegionSplatRenderer()(field, masks).shape == images.shape
-
-
-LINKS = {
-    "gaussian-blur": kornia.filters.GaussianBlur2d((3, 3), (1.0, 1.0)),
-    "sobel": kornia.filters.Sobel(),
-    "flip": K.RandomHorizontalFlip(p=1.0),
-    "jiggle": K.ColorJiggle(0.1, 0.1, 0.1, 0.1, p=1.0),
-    "affine": K.RandomAffine(10.0, p=1.0),
-    "crop": K.RandomCrop((16, 16), p=1.0),
-    "augmentations": K.AugmentationSequential(
-        K.RandomHorizontalFlip(p=1.0), K.RandomErasing(p=1.0), data_keys=["input"]
-    ),
-    "grey": kornia.color.RgbToGrayscale(),
-    "resize": kornia.geometry.Resize((12, 18), antialias=True),
-}
+LINKS = (
+    kornia.filters.GaussianBlur2d((3, 3), (1.0, 1.0)),
+    K.RandomHorizontalFlip(p=1.0),
+    kornia.geometry.Resize((12, 18), antialias=True),
+)
 
 
 class TestFirstLink:
@@ -105,42 +62,14 @@ class TestFirstLink:
         regions = RegionMap(labels, 0.7)
         return Scene(GaussianField.random(60, self.SIZE, regions=regions, seed=0), regions)
 
-    @pytest.mark.parametrize("link", LINKS)
-    def test_takes_any_link(self, scene: Scene, link: str) -> None:
-        torch.manual_seed(0)
-        image = nn.Sequential(RegionSplatRenderer(clamp=True, keepdim=False), LINKS[link])(scene)
-        assert image.ndim == 4 and len(image) == 1
+    def test_one_scene_is_a_batch_of_one(self, scene: Scene) -> None:
+        image = nn.Sequential(RegionSplatRenderer(clamp=True, keepdim=False), *LINKS)(scene)
+        assert image.shape == (1, 3, 12, 18)
         image.square().sum().backward()
         for parameter in scene.parameters():
             assert parameter.grad is not None and parameter.grad.isfinite().all() and parameter.grad.any()
 
-    def test_a_long_chain_and_a_batch(self, scene: Scene) -> None:
-        """One scene gives a batch of one; a batch of scenes stays a batch, with or without `keepdim`."""
-        links = [LINKS["gaussian-blur"], LINKS["flip"], LINKS["resize"]]
-        assert nn.Sequential(RegionSplatRenderer(keepdim=False), *links)(scene).shape == (1, 3, 12, 18)
-        field = scene.field
-        tensors = (t.detach().expand(2, -1, -1) for t in (field.means, field.cholesky, field.colors))
-        assert field.region_ids is not None
-        both = Scene(GaussianField(*tensors, field.region_ids.expand(2, -1), size=self.SIZE), scene.regions)
+    def test_a_batch_stays_a_batch(self, scene: Scene) -> None:
+        both = Scene(GaussianField.stack([scene.field, scene.field]), scene.regions)
         for keepdim in (False, True):
-            assert nn.Sequential(RegionSplatRenderer(keepdim=keepdim), *links)(both).shape == (2, 3, 12, 18)
-
-    @pytest.mark.parametrize(
-        "loss",
-        [
-            kornia.losses.MS_SSIMLoss(), kornia.losses.PSNRLoss(1.0), kornia.losses.WelschLoss(reduction="mean"),
-        ],
-        ids=lambda loss: type(loss).__name__,
-    )  # fmt: skip
-    def test_losses_and_metrics(self, scene: Scene, loss: nn.Module) -> None:
-        """They take the render as it is, and are best where it is its target."""
-        target = RegionSplatRenderer(keepdim=False, clamp=True)(scene).detach()
-        with torch.no_grad():
-            scene.field.colors.mul_(0.5)
-        image = RegionSplatRenderer(keepdim=False)(scene)
-        value = loss(image, target)
-        value.backward()
-        assert scene.field.colors.grad is not None and scene.field.colors.grad.any()
-        assert value > loss(target, target)
-        torch.testing.assert_close(psnr(image, target).squeeze(), kornia.metrics.psnr(image, target, 1.0))
-        assert 0 < kornia.metrics.ssim(image, target, 5).mean() < 1
+            assert nn.Sequential(RegionSplatRenderer(keepdim=keepdim), *LINKS)(both).shape == (2, 3, 12, 18)

@@ -11,9 +11,8 @@ import kornia
 import pytest
 import torch
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
-from kcgs import GaussianField, RegionMap, RegionSplatRenderer
+from kcgs import GaussianField, RegionSplatRenderer
 from kcgs.errors import InvalidArgument
 from kcgs.fitting import initial_field
 from kcgs.functional import region_splat
@@ -37,35 +36,16 @@ def halves() -> Tensor:
     return (torch.arange(SIZE[1]) > 17).long().expand(SIZE).contiguous()
 
 
-def features() -> nn.Module:
-    torch.manual_seed(0)
-    return nn.Sequential(nn.Conv2d(3, 8, 3, padding=1), nn.GELU(), nn.Conv2d(8, 8, 3, stride=2)).requires_grad_(False)
-
-
 def feature_loss() -> Loss:
-    network = features()
-    return lambda render, image: (network.to(render)(render) - network.to(image)(image)).square().mean()
-
-
-def edge_aware_smoothness(render: Tensor, image: Tensor) -> Tensor:
-    """Penalise slopes of the rendered brightness except where the image has edges, together with the difference."""
-    smooth = kornia.losses.inverse_depth_smoothness_loss(render.mean(1, keepdim=True), image)
-    return smooth + (render - image).square().mean()
+    torch.manual_seed(0)
+    network = nn.Sequential(nn.Conv2d(3, 8, 3, padding=1), nn.GELU()).requires_grad_(False)
+    return lambda render, image: (network(render) - network(image)).square().mean()
 
 
 LOSSES: dict[str, Loss] = {
-    "squared error": lambda render, image: (render - image).square().mean(),
     "L1": lambda render, image: (render - image).abs().mean(),
     "SSIM": lambda render, image: kornia.losses.ssim_loss(render, image, window_size=5),
     "features": feature_loss(),
-    "Sobel": lambda render, image: (kornia.filters.sobel(render) - kornia.filters.sobel(image)).abs().mean(),
-    "Laplacian": lambda render, image: (
-        (kornia.filters.laplacian(render, 5) - kornia.filters.laplacian(image, 5)).abs().mean()
-    ),
-    "edge-aware smoothness": edge_aware_smoothness,
-    "L1 and total variation": lambda render, image: (
-        (render - image).abs().mean() + 0.02 * kornia.losses.total_variation(render, reduction="mean").mean()
-    ),
 }
 
 
@@ -84,29 +64,18 @@ def descend(optimizer: GaussianAdam, error: Callable[[], Tensor], schedule: Any 
 
 
 class TestLossesFall:
-    @pytest.mark.parametrize(
-        ("name", "kind"), [*((name, "one") for name in LOSSES), ("SSIM", "double"), ("L1", "batch"), ("SSIM", "tiled")]
-    )
+    @pytest.mark.parametrize(("name", "kind"), [("L1", "one"), ("SSIM", "double"), ("features", "batch")])
     def test_in_fifty_steps(self, name: str, kind: str, device: torch.device) -> None:
         """At the default rate, with a schedule; the field is valid at every step, since the renderer takes it."""
         dtype = torch.float64 if kind == "double" else torch.float32
         image = target(2 if kind == "batch" else 1, dtype).to(device)
         regions = halves().to(device)
         field = initial_field(image, 40, regions)
-        tiled = kind == "tiled" or device.type == "cuda"
-        renderer = RegionSplatRenderer(keepdim=False, backend="tiled" if tiled else "auto")
+        renderer = RegionSplatRenderer(keepdim=False, backend="tiled" if device.type == "cuda" else "auto")
         optimizer = GaussianAdam(field.to(device))
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 50)
         losses = descend(optimizer, lambda: LOSSES[name](renderer(field, regions), image), schedule)
         assert losses[-1] < 0.6 * losses[0]
-
-    @pytest.mark.parametrize("name", LOSSES)
-    def test_gradients_are_finite_where_the_image_is_flat(self, name: str) -> None:
-        """A black image has no slope anywhere: roots of zero must not show."""
-        field = initial_field(target(), 40, halves())
-        field.colors.data.zero_()
-        LOSSES[name](RegionSplatRenderer(keepdim=False)(field, halves()), target()).backward()
-        assert all(p.grad is not None and p.grad.isfinite().all() for p in field.parameters())
 
     def test_two_fields_in_one_image(self) -> None:
         """A sum of two renders under one optimizer."""
@@ -116,14 +85,6 @@ class TestLossesFall:
             GaussianAdam(fields), lambda: (renderer(fields[0]) + renderer(fields[1]) - image).square().mean()
         )
         assert losses[-1] < 0.2 * losses[0]
-
-    def test_compiled_with_its_loss(self) -> None:
-        """One graph of render and loss, with a map that has soft contours."""
-        image, field, renderer = target(), initial_field(target(), 40, halves()), RegionSplatRenderer(keepdim=False)
-        regions = RegionMap(halves(), softness=0.7)
-        error = torch.compile(lambda: LOSSES["L1"](renderer(field, regions), image), fullgraph=True, backend="eager")
-        losses = descend(GaussianAdam(field), error)
-        assert losses[-1] < 0.6 * losses[0]
 
     def test_lbfgs(self) -> None:
         """It flattens gradients by `view`: they have the strides of parameters, which are contiguous."""
@@ -147,29 +108,20 @@ Gaussians = tuple[Tensor, Tensor, Tensor]
 WAYS: dict[str, Callable[[Gaussians], object]] = {
     "auto": lambda gaussians: splat(*gaussians),
     "tiled": lambda gaussians: region_splat(*gaussians, size=SIZE, backend="tiled"),
-    "reference": lambda gaussians: region_splat(*gaussians, size=SIZE, backend="reference"),
-    "float64": lambda gaussians: splat(*(t.double() for t in gaussians)),
-    "batch": lambda gaussians: splat(*(t.expand(3, -1, -1) for t in gaussians)),
     "torch.func.grad": lambda gaussians: torch.func.grad(splat)(*gaussians),
-    "torch.func.vmap": lambda gaussians: torch.func.vmap(splat)(*(t.expand(3, -1, -1) for t in gaussians)),
-    "checkpoint": lambda gaussians: checkpoint(splat, *gaussians, use_reentrant=False),
     "torch.compile": lambda gaussians: torch.compile(splat, fullgraph=True, backend="eager")(*gaussians),
 }
+SCALES = r"got l11 and l22 in \[-0.5, .*smaller learning rate, or kcgs.optim.GaussianAdam, which"
 
 
 class TestInvalidFields:
-    @pytest.mark.parametrize("way", WAYS)
     @pytest.mark.parametrize(
-        ("name", "value", "words"),
+        ("way", "name", "value", "words"),
         [
-            (
-                "cholesky",
-                -0.5,
-                r"got l11 and l22 in \[-0.5, .*smaller learning rate, or kcgs.optim.GaussianAdam, which",
-            ),
-            ("means", 1e9, r"got \[.*, 1e\+09\]. Where an optimizer's step made them so, take a smaller learning rate"),
-            ("means", float("nan"), r"got \d NaN or infinite values. A loss or a gradient that is not finite"),
-            ("colors", float("inf"), r"got \d NaN or infinite values. A loss or a gradient"),
+            *((way, "cholesky", -0.5, SCALES) for way in WAYS),
+            ("auto", "means", 1e9, r"got \[.*, 1e\+09\]. Where an optimizer's step made them so, take"),
+            ("auto", "means", float("nan"), r"got \d NaN or infinite values. A loss or a gradient that is not finite"),
+            ("auto", "colors", float("inf"), r"got \d NaN or infinite values. A loss or a gradient"),
         ],
     )
     def test_one_error_that_says_what_helps(self, way: str, name: str, value: float, words: str) -> None:
@@ -180,14 +132,13 @@ class TestInvalidFields:
             WAYS[way]((field.means, field.cholesky, field.colors))
         assert error.value.__cause__ is None and error.value.__context__ is None
 
-    @pytest.mark.parametrize("factor", [float("nan"), float("inf")])
-    def test_a_loss_that_is_not_finite(self, factor: float) -> None:
+    def test_a_loss_that_is_not_finite(self) -> None:
         """Nothing moves, and the loop may go on."""
         image, field, renderer = target(), initial_field(target(), 10), RegionSplatRenderer()
         before, optimizer = field.means.detach().clone(), GaussianAdam(field)
         for _ in range(2):
             optimizer.zero_grad()
-            ((renderer(field) - image).square().mean() * factor).backward()
+            ((renderer(field) - image).square().mean() * float("nan")).backward()
             with pytest.raises(
                 ValueError, match=r"gradients must be finite; got \d+ NaN or infinite values: the loss,"
             ):
