@@ -156,10 +156,10 @@ def test_masks_with_soft_edges_are_refused(blur: float, noise: int, convert: Cal
 
 @pytest.mark.parametrize("mode", ["L", "LA", "RGB"])
 def test_a_threshold_makes_two_regions_of_soft_edges(mode: str, tmp_path: Path) -> None:
-    Image.fromarray(soft_mask(1)).convert(mode).save(tmp_path / "soft.png")
-    np.save(tmp_path / "soft.npy", soft_mask(1))
-    for path in (tmp_path / "soft.png", tmp_path / "soft.npy"):
-        with pytest.raises(InvalidArgument, match=r"soft\.\w+', threshold=127\), or --threshold 127"):
+    Image.fromarray(soft_mask(1)).convert(mode).save(tmp_path / "soft{}.png")
+    np.save(tmp_path / "soft{}.npy", soft_mask(1))
+    for path in (tmp_path / "soft{}.png", tmp_path / "soft{}.npy"):
+        with pytest.raises(InvalidArgument, match=r"soft\{\}\.\w+', threshold=127\), or --threshold 127"):
             load_labels(path)
         assert torch.equal(load_labels(path, threshold=127), torch.from_numpy(soft_mask(1) > 127).long())
 
