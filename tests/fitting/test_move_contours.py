@@ -169,6 +169,7 @@ class TestMoves:
         refined = refine_contours(Scene(field, RegionMap(step(10))), step(12).float()[None])
         assert torch.equal(refined.labels, step(12))
 
+
 class TestShape:
     def test_specks_that_come_up_are_given_away(self) -> None:
         image = step(12).float()[None].clone()

@@ -114,6 +114,7 @@ class TestGain:
             is_same = marks == marks[block // 2, block // 2]
             torch.testing.assert_close(averages[image, :, row, column], (values * is_same).mean((1, 2)))
 
+
 class TestProposal:
     @pytest.mark.parametrize(("channels", "dtype"), [(1, torch.float32), (8, torch.float64)])
     def test_shapes_and_order(self, channels: int, dtype: torch.dtype) -> None:

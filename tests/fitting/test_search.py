@@ -55,9 +55,7 @@ class TestFewest:
         assert result.stop_reason == "target_psnr" and result.scene.num_gaussians == 1
 
     @pytest.mark.parametrize("target", [13.0, 21.0])
-    def test_regions_are_merged_for_the_number_of_gaussians(
-        self, photo: tuple[Tensor, Tensor], target: float
-    ) -> None:
+    def test_regions_are_merged_for_the_number_of_gaussians(self, photo: tuple[Tensor, Tensor], target: float) -> None:
         """Not for that of a trial before: with fewer none stays black, with more none is merged."""
         image, (y, x) = photo[0], torch.meshgrid(torch.arange(32), torch.arange(48), indexing="ij")
         labels = y // 8 * 6 + x // 8  # 24 regions
