@@ -135,11 +135,6 @@ class TestSwitches:
             assert bounds is not None and values.clamp(*bounds)[:, 0, 5].tolist() == clipped
         assert make_problem(image, None, 1, FitConfig(clamp=False), 0).bounds is None
 
-    def test_adan_lowers_the_squared_error(self) -> None:
-        image, labels = disc()
-        result = fit(image, labels, 12, recipe=quick(objective="l2", optimizer="adan", iterations=300))
-        assert result.history[-1].psnr > 24
-
     def test_softness_of_the_map_or_the_recipe(self) -> None:
         image, labels = disc()
         recipe = quick(iterations=1, softness=0.7)
