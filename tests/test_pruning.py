@@ -73,6 +73,14 @@ class TestPrune(
         assert counts == sorted(counts)
         assert counts[0] == 0 < counts[1] < counts[2] < counts[3] == 300
 
+    def test_no_more_could_go(self) -> None:
+        """Of Gaussians that do not overlap, all go whose colours are within the tolerance."""
+        x, y = torch.meshgrid(torch.arange(6.5, 60, 12), torch.arange(6.5, 40, 12), indexing="ij")
+        means, cholesky = torch.stack([x, y], -1).view(15, 2), torch.tensor([[0.7, 0.0, 0.7]]).expand(15, 3)
+        field = GaussianField(means, cholesky, torch.linspace(0.001, 0.015, 15)[:, None], size=(40, 60))
+        counts = [prune(Scene(field), tolerance=0.001 * k + 0.0005).num_pruned for k in range(16)]
+        assert counts == [*range(16)]
+
     def test_gaussians_that_paint_nothing_go(self, scene: Scene) -> None:
         """Those of a region that the map does not have, and those of opacity 0."""
         labels, ids, opacities = torch.zeros(40, 60).long(), torch.zeros(300).long(), torch.ones(300)

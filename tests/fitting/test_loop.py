@@ -66,7 +66,7 @@ class TestResult:
 
     @pytest.mark.parametrize("size", [(1, 1), (7, 3)])
     def test_smaller_than_a_tile(self, size: tuple[int, int]) -> None:
-        result = fit(torch.full((3, *size), 0.5), None, min(3, size[0] * size[1]), recipe=quick(iterations=400))
+        result = fit(torch.full((3, *size), 0.5), None, min(3, size[0] * size[1]), recipe=quick(iterations=100))
         assert result.history[-1].psnr > 20
 
 
@@ -115,7 +115,7 @@ class TestSwitches:
         start = fit(image, labels, 60, recipe=quick(iterations=1, warmup=False)).scene.field.region_ids
         frozen = fit(image, labels, 60, recipe=quick(warmup=False)).scene.field
         assert torch.equal(frozen.region_ids, start)
-        moved = fit(image, labels, 60, recipe=quick(iterations=300)).scene.field
+        moved = fit(image, labels, 60, recipe=quick(iterations=100)).scene.field
         assert not torch.equal(moved.region_ids, start)
 
     def test_clamp_of_saturated_pictures(self) -> None:
@@ -134,11 +134,6 @@ class TestSwitches:
             bounds = make_problem(image, None, 1, FitConfig(clamp=clamp), 0).bounds
             assert bounds is not None and values.clamp(*bounds)[:, 0, 5].tolist() == clipped
         assert make_problem(image, None, 1, FitConfig(clamp=False), 0).bounds is None
-
-    def test_adan_lowers_the_squared_error(self) -> None:
-        image, labels = disc()
-        result = fit(image, labels, 12, recipe=quick(objective="l2", optimizer="adan", iterations=300))
-        assert result.history[-1].psnr > 24
 
     def test_softness_of_the_map_or_the_recipe(self) -> None:
         image, labels = disc()
@@ -193,6 +188,7 @@ class TestStopping:
             return renderer.regions
 
         image, labels = disc()
+        monkeypatch.setattr("kcgs.fitting.loop.precompile", lambda config, device: None)
         monkeypatch.setattr(contours, "move_contours", move)
         monkeypatch.setattr(contours, "_SECONDS_PER_PIXEL", seconds / labels.numel())
         result = fit(image, labels, 12, recipe="best", iterations=10**7, max_seconds=3.0)
@@ -207,7 +203,7 @@ class TestStopping:
 
 def test_paper_beats_both_baselines() -> None:
     """The paper's first experiment in short: 20 Gaussians, guidance far ahead of the baseline at contours."""
-    image, labels = (part[..., ::2, ::2] for part in chart_2x3())
+    image, labels = (part[..., ::4, ::4] for part in chart_2x3())
     best = {}
     for recipe in ("paper", "gaussian-image", "gaussian-image-clamp"):
         history = fit(image, labels, 20, recipe=recipe, iterations=200).history

@@ -171,12 +171,14 @@ def test_first_gaussians_that_do_not_fit(field: object, words: str) -> None:
         fit(image(), None, 60, initializer=lambda *arguments: field)
 
 
-def test_first_gaussians_with_opacities() -> None:
-    def faint(images: Tensor, count: int, *arguments: object) -> GaussianField:
-        first = initial_field(images, count)
-        opacities = torch.full((1, count), 0.5)
-        return GaussianField(first.means, first.cholesky, first.colors, None, opacities, size=first.size)
+def faint(images: Tensor, count: int, *arguments: object) -> GaussianField:
+    """Return first Gaussians with opacities."""
+    first = initial_field(images, count)
+    opacities = torch.full((len(images), count), 0.5)
+    return GaussianField(first.means, first.cholesky, first.colors, None, opacities, size=first.size)
 
+
+def test_first_gaussians_with_opacities() -> None:
     def merged(*arguments: Any) -> GaussianField:
         return faint(*arguments).without_opacities()
 
@@ -286,6 +288,7 @@ class TestLoop:
             (lambda: propose_gaussians(image(), 3, LABELS[1:]), ValueError, "regions must be one map of the image's"),
             (lambda: lowest_impact(3, 3), TypeError, "field must be a GaussianField; got int"),
             (lambda: lowest_impact(initial_field(image(), 5), 6), ValueError, r"num_gaussians must be in \[0, 5\]"),
+            (lambda: lowest_impact(faint(image()[None], 5), 3), ValueError, "field must be without opacities"),
             (lambda: lowest_impact(initial_field(image(), 5, LABELS), 3), ValueError,
              "regions must be given where the field has region ids"),
             (lambda: lowest_impact(initial_field(image(), 5), 3, LABELS), ValueError,

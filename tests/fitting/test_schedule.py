@@ -97,7 +97,7 @@ class TestMaps:
         labels[3:6, 15:17] = 0
         labels[30:33, 13:15] = 1
         gain = torch.zeros(40, 30)
-        gain[:20], gain[20:] = 1.0, -1.0
+        gain[1], gain[28] = 1.0, -1.0  # two pixels above a group
         accepted = accept_moves(before, RegionMap(labels), gain).labels
         assert torch.equal(accepted[:20], labels[:20])
         assert torch.equal(accepted[20:], before.labels[20:])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -38,6 +39,13 @@ def stripes(photo: Tensor) -> Photo:
 def speckles(photo: Tensor) -> Photo:
     """Return a photo with a label map that takes more bytes than Gaussians in its place."""
     return photo, SPECKLES.repeat_interleave(4, 0).repeat_interleave(4, 1)
+
+
+@pytest.fixture(autouse=True)
+def _short_descent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shorten what follows the fit, which takes 400 iterations or more."""
+    for name, budget in BUDGETS.items():
+        monkeypatch.setitem(BUDGETS, name, replace(budget, compress_iterations=80))
 
 
 class TestFitBytes:

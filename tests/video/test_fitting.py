@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcgs import Scene
+from kcgs import GaussianField, Scene
 from kcgs.editing import move_region, recolor_region
 from kcgs.editing.masks import dilate
 from kcgs.functional import psnr
@@ -129,12 +129,17 @@ class TestFitVideo:
 
 
 class TestInterpolate:
-    @pytest.mark.parametrize("number", [0, 1])
-    def test_error(self, scenes: Scene, number: int) -> None:
+    def test_gaussians_of_both_frames_meet(self) -> None:
+        means, cholesky = torch.tensor([[[24.5, 24.5]], [[28.5, 22.5]]]), torch.tensor([6.0, 0.0, 6.0]).expand(2, 1, 3)
+        field = interpolate(Scene(GaussianField(means, cholesky, torch.full((2, 1, 3), 0.8), size=SIZE)), 0.25).field
+        torch.testing.assert_close(field.means.detach(), torch.tensor([[25.5, 24.0]] * 2), atol=0.1, rtol=0.0)
+        torch.testing.assert_close(field.colors.detach()[:, 0], torch.tensor([0.6, 0.2]))
+
+    def test_error(self, scenes: Scene) -> None:
         """It is 2 dB lower than that of the mean of the frames, where something moves."""
-        image, labels = moving_disc(2.0 * number + 1)
+        image, labels = moving_disc(3.0)
         every_second = scenes[::2]
-        renders = interpolate(every_second, number + 0.5).render(), every_second[number : number + 2].render().mean(0)
+        renders = interpolate(every_second, 1.5).render(), every_second[1:].render().mean(0)
         errors = [(render - image)[:, labels == 7].square().mean() for render in renders]
         assert errors[0] < 0.63 * errors[1]
 
