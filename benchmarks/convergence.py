@@ -21,9 +21,10 @@ BUDGETS = (2, 5, 15, 60)  # seconds of a core
 QUANTITIES = ("psnr", "ef_psnr")
 CASES = ["budget"]
 COMPARISONS = tuple(Comparison("best", other) for other in OTHERS)
-METHOD = f"""First frames of DAVIS with the given masks, N = {NUM_GAUSSIANS:,}. Each point is a fit of its own on one core.
-`best` and `best-baseline` have `max_seconds`. The schedules of the published methods need a number of iterations: two
-short fits tell how long an iteration takes. Compilation is not in the times. Table: PSNR / EF-PSNR in dB."""
+METHOD = f"""First frames of DAVIS with the given masks, N = {NUM_GAUSSIANS:,}. Each point is a fit of
+its own on one core. `best` and `best-baseline` have `max_seconds`. The schedules of the published methods need a number
+of iterations: two short fits tell how long an iteration takes. Compilation is not in the times. Table: PSNR / EF-PSNR
+in dB."""
 METHOD_OF_GPU = f""" `{GPU}` is a fit of 700 iterations, measured for the report of `gpu-fit`: its seconds are those of
 the call on a GPU."""
 
