@@ -9,7 +9,15 @@ import torch
 
 from kcgs._check import check_count
 from kcgs.errors import InvalidArgument
-from kcgs.maps import RegionMap, largest_softness, nearest_labels, softness_between, softness_of_map, touching_pairs
+from kcgs.maps import (
+    RADIUS_SIGMAS,
+    RegionMap,
+    largest_softness,
+    nearest_labels,
+    softness_between,
+    softness_of_map,
+    touching_pairs,
+)
 from kcgs.nn import GaussianField, join, scaled_gaussians
 from kcgs.scene import Scene, check_scene
 
@@ -22,9 +30,6 @@ from .selection import (
     select_removable_regions,
     warn_of_lost_regions,
 )
-
-# distance from a soft contour, in its standard deviations, beyond which memberships count as 0 or 1
-_CONTOUR_SIGMAS = 4.0
 
 
 def move_region(
@@ -90,7 +95,7 @@ def move_region(
 
 def _contour_reach(regions: RegionMap) -> int:
     """Return the distance from a contour, in pixels, within which the background of a region is visible."""
-    return math.ceil(1.0 + _CONTOUR_SIGMAS * largest_softness(softness_of_map(regions.softness)))
+    return math.ceil(1.0 + RADIUS_SIGMAS * largest_softness(softness_of_map(regions.softness)))
 
 
 def delete_region(scene: Scene, region_ids: int | Iterable[int], *, fill: bool = True, margin: int = MARGIN) -> Scene:

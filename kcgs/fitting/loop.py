@@ -186,7 +186,7 @@ def fit_problem(
         store = None if checkpoint is None else Checkpoint(checkpoint, problem)
         if store is not None and resume and store.path.exists():
             state, seconds = store.read()
-            return run_from(state, Clock(seconds), store=store)
+            return run_from(state, Clock(seconds), store=store, until=until)
         clock = Clock()
         return run_from(start(problem), clock, store=store, until=until)
 

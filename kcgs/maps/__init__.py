@@ -24,6 +24,7 @@ from .regions import RegionMap, wrap_labels
 from .resampled import LEAST_BLUR, SmoothMembership, cut_windows, find_windows, sharpness
 from .softness import (
     MAX_SOFTNESS,
+    GivenSoftness,
     PairSoftness,
     largest_softness,
     mean_softness,

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import torch
 
-from kcgs.maps import RegionMap
+from kcgs.maps import GivenSoftness, PairSoftness, RegionMap, softness_of_map, touching_pairs
 from kcgs.nn import GaussianField
 from kcgs.scene import Scene
 
@@ -17,10 +17,16 @@ def stack(frames: Sequence[Scene], metadata: Mapping[str, str]) -> Scene:
     maps = [frame.regions for frame in frames if frame.regions is not None]
     if not maps:
         return Scene(field, None, metadata)
-    # a pair of regions has the same softness in all frames
-    softness: dict[tuple[int, int], float] = {}
-    for regions in maps:
-        softness |= regions.softness if isinstance(regions.softness, Mapping) else {}
     labels = torch.stack([regions.labels for regions in maps])
-    regions = RegionMap(labels, softness or maps[0].softness)
-    return Scene(field, regions, metadata)
+    return Scene(field, RegionMap(labels, _softness_of_all(maps)), metadata)
+
+
+def _softness_of_all(maps: Sequence[RegionMap]) -> GivenSoftness:
+    """Return the softness of all frames: a pair of regions has the same one in each frame in which it touches."""
+    softness = [softness_of_map(regions.softness) for regions in maps]
+    if not any(isinstance(one, PairSoftness) for one in softness):
+        return softness[0]
+    pairs: dict[tuple[int, int], float] = {}
+    for one, regions in zip(softness, maps, strict=True):
+        pairs |= one if isinstance(one, PairSoftness) else dict.fromkeys(touching_pairs(regions.labels), one)
+    return pairs

@@ -8,11 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from kcgs import GaussianField, Scene
+from kcgs import GaussianField, RegionMap, Scene
 from kcgs.editing import move_region, recolor_region
 from kcgs.editing.masks import dilate
 from kcgs.functional import psnr
 from kcgs.video import delete_from_video, fit_video, interpolate, move_in_video
+from kcgs.video.stacking import stack
 
 SIZE = (48, 64)
 SETTINGS: dict[str, Any] = {"num_gaussians": 80, "iterations": 200}
@@ -75,6 +76,14 @@ class TestFitVideo:
         settings = {"num_gaussians": 40, "iterations": 40, "on_frame": lambda _, scene: rendered.append(scene.render())}
         whole = fit_video(frames, maps, **settings)
         assert torch.allclose(whole.render(), torch.stack(rendered), atol=1e-5)
+
+    def test_softness_of_regions_that_touch_in_one_frame_only(self) -> None:
+        """Also where all contours of that frame have the same softness."""
+        thirds, halves = torch.arange(SIZE[1]) // 22, 2 * (torch.arange(SIZE[1]) // 33)
+        maps = RegionMap(thirds.expand(SIZE), {(0, 1): 0.5, (1, 2): 1.0}), RegionMap(halves.expand(SIZE), 0.7)
+        frames = [Scene(GaussianField.random(9, SIZE, regions=regions, seed=0), regions) for regions in maps]
+        regions = stack(frames, {}).regions
+        assert regions is not None and regions.softness == {(0, 1): 0.5, (1, 2): 1.0, (0, 2): 0.7}
 
     def test_scene_cut(self) -> None:
         """A map of the first frame moves along until a cut; another shot is fitted anew, without it."""
