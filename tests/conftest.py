@@ -30,35 +30,35 @@ settings.register_profile(
 )
 settings.load_profile("kcgs")
 
-# The files that take longest, 8 seconds and more, in the order of their time: workers begin with them, so that the last
+# The files that take longest, 10 seconds and more, in the order of their time: workers begin with them, so that the last
 # file to end is a short one. (By itself pytest-xdist begins with the files of most tests, and these have few.)
-# The first two go to two workers: golden compiles every kernel, while the site needs none.
+# The first two go to two workers: golden compiles every kernel, and pages run in processes of their own.
 LONGEST = (
     "golden/test_golden.py",
-    "docs/test_site.py",
-    "notebooks/test_notebooks.py",
-    "onnx/test_torch_export.py",
+    "docs/test_pages.py",
     "benchmarks/test_quick.py",
+    "notebooks/test_notebooks.py",
+    "docs/test_site.py",
     "engine/test_ray.py",
     "test_triton.py",
-    "cli/test_many.py",
-    "kernels/test_cpu.py",
-    "rate/test_fitting.py",
-    "export/test_web.py",
-    "docs/test_pages.py",
-    "pipelines/test_torch_transforms.py",
-    "fitting/test_best.py",
-    "engine/test_local.py",
-    "cli/test_files.py",
-    "fitting/test_loop.py",
-    "onnx/test_scene.py",
-    "codec/test_hostile.py",
-    "export/test_decoder.py",
-    "cli/test_cli.py",
-    "pipelines/test_encoder.py",
-    "pipelines/test_editing_fill.py",
     "export/test_element.py",
+    "pipelines/test_torch_transforms.py",
     "test_wheel.py",
+    "engine/test_local.py",
+    "cli/test_cli.py",
+    "export/test_web.py",
+    "test_memory.py",
+    "cli/test_many.py",
+    "onnx/test_scene.py",
+    "compiled/test_threads.py",
+    "video/test_fitting.py",
+    "rate/test_fitting.py",
+    "test_parallel.py",
+    "onnx/test_torch_export.py",
+    "kernels/test_cpu.py",
+    "codec/test_label_files.py",
+    "test_package.py",
+    "rate/test_compress.py",
 )
 
 
