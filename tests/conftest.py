@@ -30,8 +30,8 @@ settings.register_profile(
 )
 settings.load_profile("kcgs")
 
-# The files that take longest, 10 seconds and more, in the order of their time: workers begin with them, so that the last
-# file to end is a short one. (By itself pytest-xdist begins with the files of most tests, and these have few.)
+# The files that take longest, 10 seconds and more, by their time: workers begin with them, so that the last file to end
+# is a short one. (By itself pytest-xdist begins with the files of most tests, and these have few.)
 # The first two go to two workers: golden compiles every kernel, and pages run in processes of their own.
 LONGEST = (
     "golden/test_golden.py",
