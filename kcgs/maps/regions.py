@@ -67,19 +67,13 @@ class RegionMap:
         with torch.inference_mode(False):  # autograd saves no tensor of inference mode
             self._fill(*table_of_labels(check_labels("labels", labels).clone(), softness))
 
-    @classmethod
-    def _of_table(cls, table: MapTable, softness: Softness) -> RegionMap:
-        """Return the map of a table at its own size."""
-        regions = cls.__new__(cls)
-        regions._fill(table, softness)
-        return regions
-
-    def _fill(self, table: MapTable, softness: Softness) -> None:
-        """Take a table at its own size."""
+    def _fill(self, table: MapTable, softness: Softness) -> RegionMap:
+        """Take a table at its own size; return the map."""
         assert table.positions is not None
         self._labels, self._index, self._softness = table.labels, table.positions, softness
         self._table = table  # that of the source, where there is one
         self._source: RegionMap | None = None  # the map that a resized map interpolates
+        return self
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle no derived tensors: torch moves the memory of each tensor that it sends to another process."""
@@ -271,7 +265,7 @@ class RegionMap:
         """Return the map with a function applied to each of its tensors."""
         if self._source is not None:
             return self._source._with_tensors(function).resize(self.size)
-        return RegionMap._of_table(self._table.apply(function), self._softness)
+        return RegionMap.__new__(RegionMap)._fill(self._table.apply(function), self._softness)
 
     def __getitem__(self, index: int | slice) -> RegionMap:
         """Copy one map of a batch, or a slice of the batch, with only the regions that occur in it.
@@ -344,7 +338,7 @@ class RegionMap:
             return self._source.resize((height, width))
         ratio = height * width / (self.size[0] * self.size[1])
         softness = for_each(self._softness, lambda one: scaled_softness(one, ratio))
-        regions = RegionMap._of_table(self._table, softness)
+        regions = RegionMap.__new__(RegionMap)._fill(self._table, softness)
         regions._labels, regions._index = (sample_labels(t, height, width) for t in (self._labels, self._index))
         regions._source = self
         return regions
@@ -352,4 +346,4 @@ class RegionMap:
 
 def wrap_labels(labels: Tensor, softness: GivenSoftness) -> RegionMap:
     """Make the map of valid int64 labels without a copy; the caller must not write to them."""
-    return RegionMap._of_table(*table_of_labels(labels, softness))
+    return RegionMap.__new__(RegionMap)._fill(*table_of_labels(labels, softness))
